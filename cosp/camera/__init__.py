@@ -1,0 +1,1 @@
+"""The panoramic camera: missions, exterior orientation, projection and rays."""

@@ -1,0 +1,1 @@
+"""Arrays of pixels: windows, resampling, correlation, contrast."""

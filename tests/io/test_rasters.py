@@ -1,0 +1,90 @@
+"""Rasters: half pixels, windows, reference systems, whole files or none."""
+
+import numpy as np
+import pytest
+import rasterio
+from numpy.testing import assert_allclose
+
+from cosp.errors import InputError
+from cosp.geometry.grids import PixelGrid
+from cosp.imaging.windows import Window
+from cosp.io import rasters
+
+MAP = PixelGrid(600_005.0, 5_199_995.0, 10.0, -10.0, (40, 50))
+
+
+def heights():
+    return np.arange(2000, dtype=np.float32).reshape(40, 50)
+
+
+def test_the_geotransform_holds_the_corner_and_the_grid_the_centre(tmp_path):
+    rasters.write(tmp_path / "h.tif", heights(), grid=MAP, crs="EPSG:32632")
+    with rasterio.open(tmp_path / "h.tif") as dataset:
+        assert (dataset.transform.c, dataset.transform.f) == (600_000.0, 5_200_000.0)
+    assert rasters.info(tmp_path / "h.tif").grid == MAP
+    assert rasters.info(tmp_path / "h.tif").crs == "EPSG:32632"
+
+
+def test_film_keeps_its_millimetres(tmp_path):
+    film = PixelGrid(-357.0, 27.0, 0.007, -0.007, (30, 60))
+    rasters.write(tmp_path / "f.tif", np.zeros((30, 60), np.uint8), grid=film, crs=rasters.FILM_CRS)
+    found = rasters.info(tmp_path / "f.tif").grid
+    assert_allclose([found.x0, found.y0, found.step_x], [film.x0, film.y0, film.step_x], atol=1e-9)
+    with rasterio.open(tmp_path / "f.tif") as dataset:
+        assert 'UNIT["unknown",0.001]' in dataset.crs.to_wkt() or "millimetre" in dataset.crs.to_wkt()
+
+
+def test_windows_are_the_same_pixels(tmp_path):
+    with rasters.create(tmp_path / "w.tif", shape=(40, 50), dtype="float32", grid=MAP, crs=None) as writer:
+        for window in (Window(0, 20, 0, 50), Window(20, 40, 0, 50)):
+            writer.write(window, heights()[window.slices])
+    window = Window(15, 30, 7, 12)
+    assert np.array_equal(rasters.read(tmp_path / "w.tif", window=window), heights()[window.slices])
+
+
+def test_a_failed_write_leaves_nothing(tmp_path):
+    def fail():
+        with rasters.create(tmp_path / "w.tif", shape=(40, 50), dtype="uint8", grid=MAP, crs=None):
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_warping_onto_the_same_grid_changes_nothing_and_outside_is_nan(tmp_path):
+    rasters.write(tmp_path / "h.tif", heights(), grid=MAP, crs="EPSG:32632")
+    assert np.array_equal(rasters.read_on_grid(tmp_path / "h.tif", MAP, "EPSG:32632"), heights())
+    shifted = rasters.read_on_grid(tmp_path / "h.tif", MAP.window(0, 40, 25, 75), "EPSG:32632")
+    assert np.array_equal(shifted[:, :24], heights()[:, 25:49])
+    assert np.isnan(shifted[:, 26:]).all()
+
+
+def test_a_cloud_optimised_file_is_valid_and_equal(tmp_path):
+    cogeo = pytest.importorskip("rio_cogeo.cogeo")
+    grid = PixelGrid(600_005.0, 5_199_995.0, 10.0, -10.0, (1500, 1300))
+    values = np.random.default_rng(0).normal(size=grid.shape).astype(np.float32)
+    rasters.write(tmp_path / "c.tif", values, grid=grid, crs="EPSG:32632", cog=True)
+    assert cogeo.cog_validate(tmp_path / "c.tif")[0]
+    assert np.array_equal(rasters.read(tmp_path / "c.tif"), values)
+
+
+def test_reduced_reading_is_the_block_mean(tmp_path):
+    rasters.write(tmp_path / "h.tif", heights(), grid=MAP, crs="EPSG:32632")
+    expected = heights().reshape(10, 4, 25, 2).mean((1, 3))[:, ::1]
+    reduced = rasters.read_reduced(tmp_path / "h.tif", 2)
+    assert_allclose(reduced.reshape(10, 2, 25).mean(1), expected)
+
+
+def test_missing_wrong_and_truncated_files_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"none\.tif: no such file"):
+        rasters.read(tmp_path / "none.tif")
+    (tmp_path / "text.tif").write_text("this is no picture")
+    with pytest.raises(InputError, match=r"text\.tif: not a raster"):
+        rasters.info(tmp_path / "text.tif")
+    noise = np.random.default_rng(0).integers(0, 255, (2000, 2000), np.uint8)
+    rasters.write(tmp_path / "cut.tif", noise, grid=MAP)
+    whole = (tmp_path / "cut.tif").read_bytes()
+    (tmp_path / "cut.tif").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut\.tif"):
+        rasters.read(tmp_path / "cut.tif")
