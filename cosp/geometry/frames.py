@@ -34,8 +34,8 @@ class LocalFrame:
     def _transformer(self) -> Transformer:
         return Transformer.from_pipeline(
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-            f"+step +proj=topocentric +ellps=WGS84 +lon_0={self.longitude_deg!r} +lat_0={self.latitude_deg!r} "
-            f"+h_0={self.height_m!r}"
+            f"+step +proj=topocentric +ellps=WGS84 +lon_0={float(self.longitude_deg)!r} "
+            f"+lat_0={float(self.latitude_deg)!r} +h_0={float(self.height_m)!r}"
         )
 
     def local_from_geodetic(self, lonlath: FloatArray) -> FloatArray:

@@ -1,0 +1,1 @@
+"""Bundle adjustment of panoramic cameras: control, tie points, priors, diagnostics."""

@@ -1,0 +1,123 @@
+"""What an adjustment is told: control and tie points with their weights, priors of the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosp.arrays import FloatArray
+from cosp.camera.panoramic import PanoramicCamera
+
+
+@dataclass(frozen=True)
+class Control:
+    """Ground points seen in one image.
+
+    Parameters
+    ----------
+    film_mm : (N, 2) array, mm
+    ground_m : (N, 3) array, m
+        In the local frame of the block.
+    sigma_mm : (N,) array, mm
+        Standard deviation of the film point, per axis.
+    sigma_ground_m, sigma_height_m : (N,) arrays, m
+        Standard deviations of the ground point, per horizontal axis and in height.
+    """
+
+    film_mm: FloatArray
+    ground_m: FloatArray
+    sigma_mm: FloatArray
+    sigma_ground_m: FloatArray
+    sigma_height_m: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.film_mm)
+
+
+@dataclass(frozen=True)
+class Ties:
+    """Conjugate points of two images of a block; their ground points are unknown.
+
+    Parameters
+    ----------
+    first, second : int
+        Which images of the block.
+    first_mm, second_mm : (N, 2) arrays, mm
+    sigma_mm : (N,) array, mm
+        Standard deviation of each film point, per axis.
+    """
+
+    first: int
+    second: int
+    first_mm: FloatArray
+    second_mm: FloatArray
+    sigma_mm: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.first_mm)
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Standard deviations of what is believed of a camera before any point is measured; the start camera is the mean.
+
+    They keep parameters that a film hardly tells apart from running away and are weak enough to leave the others alone.
+
+    Parameters
+    ----------
+    horizontal_m, height_m : float
+        Position at mid-scan.
+    velocity_m : three floats
+        Change of position over the scan: along the flight, across it, up.
+    angles_deg : three floats
+        Omega, phi, kappa at mid-scan.
+    rates_deg : three floats
+        Their change over the scan.
+    imc_factor : float
+
+    References
+    ----------
+    docs/conventions.md, "Priors".
+    """
+
+    horizontal_m: float
+    height_m: float
+    velocity_m: tuple[float, float, float]
+    angles_deg: tuple[float, float, float]
+    rates_deg: tuple[float, float, float]
+    imc_factor: float
+
+    def information(self, camera: PanoramicCamera) -> FloatArray:
+        """Inverse covariance of the 13 parameters, (13, 13), with the velocity turned into the camera's heading."""
+        kappa = np.radians(camera.angles_deg[2])
+        # Rows: along the flight (-y of the film), across it, up.
+        heading = np.array([[np.sin(kappa), -np.cos(kappa), 0.0], [np.cos(kappa), np.sin(kappa), 0.0], [0.0, 0.0, 1.0]])
+        information = np.zeros((13, 13))
+        information[3:6, 3:6] = heading.T @ np.diag(1.0 / np.square(self.velocity_m)) @ heading
+        sigma = [
+            *(self.horizontal_m, self.horizontal_m, self.height_m),
+            *(np.inf, np.inf, np.inf),
+            *np.radians(self.angles_deg),
+            *np.radians(self.rates_deg),
+            self.imc_factor,
+        ]
+        return np.asarray(information + np.diag(1.0 / np.square(sigma)))
+
+
+PLAIN_PRIORS = Priors(
+    horizontal_m=100_000.0,
+    height_m=20_000.0,
+    velocity_m=(1000.0, 1000.0, 1000.0),
+    angles_deg=(3.0, 3.0, 8.0),
+    rates_deg=(0.5, 0.5, 0.3),
+    imc_factor=0.02,
+)
+FIELD_PRIORS = Priors(
+    horizontal_m=100_000.0,
+    height_m=5_000.0,
+    velocity_m=(80.0, 50.0, 30.0),
+    angles_deg=(3.0, 3.0, 8.0),
+    rates_deg=(0.1, 0.5, 0.1),
+    imc_factor=0.002,
+)

@@ -1,0 +1,1 @@
+"""Elevation models: terrain, coregistration, differences, mosaics."""

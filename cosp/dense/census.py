@@ -1,0 +1,59 @@
+"""Census transform: each pixel as the list of its neighbours that are darker, blind to brightness and contrast."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from cosp.arrays import ByteArray
+from cosp.dense import kernels
+
+_log = logging.getLogger(__name__)
+
+
+def left_census(image: ByteArray) -> ByteArray:
+    """Census of the left picture, 7 x 9 neighbours in byte planes.
+
+    Parameters
+    ----------
+    image : (rows, columns) array, contiguous
+        Grey values; 0 is no data, which becomes a pattern that is equally unlike everything.
+
+    Returns
+    -------
+    (8, rows, columns) array
+        Hamming distance between the eight bytes of two pixels is their matching cost, 0 to 62.
+
+    References
+    ----------
+    [Zabih1994].
+    """
+    return _census(image, kernels.LEFT_BLANK)
+
+
+def right_census(image: ByteArray) -> ByteArray:
+    """Census of the right picture; see `left_census`."""
+    return _census(image, kernels.RIGHT_BLANK)
+
+
+def _census(image: ByteArray, blank: int) -> ByteArray:
+    planes = np.empty((kernels.PLANES, *image.shape), np.uint8)
+    wide_enough = image.shape[1] >= kernels.CENSUS_BLOCK + kernels.CENSUS_COLUMNS - 1
+    transform = _transform() if wide_enough else kernels.census_plain
+    transform(image, planes, blank)
+    return planes
+
+
+@cache
+def _transform() -> Callable[[ByteArray, ByteArray, int], None]:
+    """The vector form where this machine's compiler takes it, else the plain loops."""
+    try:
+        image = np.zeros((8, 64), np.uint8)
+        kernels.census_vector(image, np.empty((kernels.PLANES, 8, 64), np.uint8), kernels.LEFT_BLANK)
+    except Exception as error:  # whatever the compiler stumbles over, the loops give the same bits
+        _log.warning("vector form of the census does not compile here, plain loops are used: %s", error)
+        return kernels.census_plain
+    return kernels.census_vector

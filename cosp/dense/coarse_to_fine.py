@@ -1,0 +1,258 @@
+"""Dense matching from coarse to fine: work per pixel stays the same whatever the relief.
+
+At each level of a pyramid the right picture is resampled with the disparity of the level before. What is left over is
+small, and slopes have become flat, which is what semi-global aggregation likes; a fixed small range of disparities is
+searched for it. Tiles are matched side by side in threads; each sees `HALO_PX` of its neighbours, so that the result in
+its interior does not depend on where tiles end.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cosp.arrays import ByteArray, Float32Array
+from cosp.dense.aggregation import aggregate_costs
+from cosp.dense.census import left_census, right_census
+from cosp.dense.resampling import SmoothField, median_of_given, picture_pyramid, prior_of, resample_right
+from cosp.dense.selection import DisparityMap, select_disparities
+from cosp.dense.validity import Validity, no_data, picture_validity, speckles
+from cosp.imaging.windows import Window, tiles
+
+_log = logging.getLogger(__name__)
+
+TILE_PX = 1536
+HALO_PX = 48
+"""What a tile sees of its neighbours."""
+
+STRIP_HALO_PX = 256
+"""What a strip matched on its own must see of its neighbours: coarse levels look further."""
+
+LEFT_OVER = 32
+"""Disparities searched at the fine levels for what the level before did not know."""
+
+FRACTIONS = 64
+"""Disparities are rounded to this part of a pixel, a tenth of their noise, so that files compress."""
+
+_SLACK_PX = 8  # coarse pixels searched beyond the range on either side; columns resampled beyond what is searched
+_FEWEST_LEVELS = 2
+_NO_FIELD = SmoothField(np.zeros((1, 1), np.float32), 0.0, 0.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One matching of the whole picture: pyramid level, number of disparities searched."""
+
+    level: int
+    disparities: int
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What all tiles of one pass share."""
+
+    step: Pass
+    left: ByteArray
+    right: ByteArray
+    before: Float32Array | None  # disparity of the pass before, at `before_level`
+    before_level: int
+    range_px: tuple[float, float]  # at this level
+    y_parallax: SmoothField
+    small_step: int
+    large_step: int
+
+
+def plan_passes(span_px: float) -> list[Pass]:
+    """Levels and ranges that find any disparity of a span, coarsest first.
+
+    The coarsest level searches everything, then once more what that left over, now that slopes are flat. Mistakes of
+    the coarse levels last and their work is little, so those search widely, and twice.
+    """
+    levels = _FEWEST_LEVELS
+    while span_px / 2**levels + 2 * _SLACK_PX > 2 * LEFT_OVER:
+        levels += 1
+    whole = LEFT_OVER if span_px / 2**levels + 2 * _SLACK_PX <= LEFT_OVER else 2 * LEFT_OVER
+    passes = [Pass(levels, whole), Pass(levels, 2 * LEFT_OVER)]
+    for level in range(levels - 1, -1, -1):
+        if level >= 2:
+            passes.append(Pass(level, 2 * LEFT_OVER))
+        passes.append(Pass(level, LEFT_OVER))
+    return passes
+
+
+def match(
+    left: ByteArray,
+    right: ByteArray,
+    disparity_range_px: tuple[float, float],
+    *,
+    small_step: int,
+    large_step: int,
+    least_texture_sd: float,
+    saturated_from: int,
+    largest_speckle_px: int,
+    speckle_step_px: float,
+    threads: int,
+    y_parallax: SmoothField | None = None,
+    tile_px: int = TILE_PX,
+) -> DisparityMap:
+    """Disparity of every pixel of the left picture that can be matched with confidence.
+
+    The same whatever the number of threads. Right column = left column + disparity, right row = left row + y-parallax.
+
+    Parameters
+    ----------
+    left, right : (rows, columns) arrays
+        Rectified pictures with the same rows; columns may differ. 0 is no data.
+    disparity_range_px : (lowest, highest)
+    small_step, large_step : int
+        Penalties of a change of disparity by one and by more between neighbours, in bits of the census (62).
+    least_texture_sd : float, grey values
+        Standard deviation within 9 x 9 px below which a pixel is masked.
+    saturated_from : int
+        Grey value from which film counts as saturated; a pixel is masked where most of the 9 x 9 px are.
+    largest_speckle_px, speckle_step_px
+        Islands of up to so many pixels, cut off by steps of more than so much, are masked.
+    y_parallax : SmoothField, px
+        Right row minus left row by left pixel; taken out in the resampling that happens anyway.
+
+    References
+    ----------
+    [Hirschmuller2008] for the aggregation, [Zabih1994] for the cost.
+    """
+    low, high = disparity_range_px
+    if not low < high:
+        raise ValueError(f"disparity range {low} to {high} px: the lowest must be less than the highest")
+    if left.shape[0] != right.shape[0]:
+        raise ValueError(f"pictures of {left.shape[0]} and {right.shape[0]} rows: the same number is needed")
+    passes = plan_passes(high - low)
+    levels = passes[0].level
+    lefts = picture_pyramid(np.ascontiguousarray(left), levels)
+    rights = picture_pyramid(np.ascontiguousarray(right), levels)
+    found: Float32Array | None = None
+    level = levels
+
+    def task_of(step: Pass) -> _Task:
+        return _Task(
+            step,
+            lefts[step.level],
+            rights[step.level],
+            found,
+            level,
+            (low / 2**step.level, high / 2**step.level),
+            y_parallax or _NO_FIELD,
+            # Before the first resampling slopes are not flat yet.
+            small_step if found is not None else max(small_step // 2, 1),
+            large_step,
+        )
+
+    for step in passes[:-1]:
+        coarse = np.empty(lefts[step.level].shape, np.float32)
+        task = task_of(step)
+
+        def keep(window: Window, task: _Task = task, coarse: Float32Array = coarse) -> None:
+            grown = window.grown(HALO_PX, coarse.shape)
+            coarse[window.slices] = _matched(task, grown).disparity[window.inside(grown).slices]
+
+        _log.info("level %d: %d disparities", step.level, step.disparities)
+        # The volume of a tile stays the same.
+        size = tile_px if step.disparities == LEFT_OVER else 2 * tile_px // 3
+        _over_tiles(keep, coarse.shape, size, threads)
+        found, level = coarse, step.level
+
+    result = DisparityMap(
+        np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8), np.empty(left.shape, np.uint8)
+    )
+    last = task_of(passes[-1])
+
+    def finish(window: Window) -> None:
+        grown = window.grown(HALO_PX, left.shape)
+        tile = _cleaned(
+            _matched(last, grown, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
+            largest_speckle_px=largest_speckle_px,
+            speckle_step_px=speckle_step_px,
+        )
+        inside = window.inside(grown).slices
+        result.disparity[window.slices] = tile.disparity[inside]
+        result.validity[window.slices] = tile.validity[inside]
+        result.confidence[window.slices] = tile.confidence[inside]
+
+    _log.info("level 0: %d disparities", passes[-1].disparities)
+    _over_tiles(finish, left.shape, tile_px, threads)
+    return result
+
+
+def _over_tiles(work: Callable[[Window], None], shape: tuple[int, ...], tile_px: int, threads: int) -> None:
+    """Do the work of every tile, so many at once; each writes to its own part of the result."""
+    windows = tiles((shape[0], shape[1]), tile_px)
+    cv2.setNumThreads(1)
+    with ThreadPoolExecutor(threads) as pool:
+        for done, _ in enumerate(pool.map(work, windows), start=1):
+            _log.debug("tile %d/%d", done, len(windows))
+
+
+def _matched(
+    task: _Task, window: Window, *, least_texture_sd: float | None = None, saturated_from: int = 256
+) -> DisparityMap:
+    """One pass in one window. Without a least texture only data and consistency are asked for, as a prior needs."""
+    left = np.ascontiguousarray(task.left[window.slices])
+    if not left.any():
+        outside = np.full(left.shape, int(Validity.NO_DATA_LEFT), np.uint8)
+        return DisparityMap(np.full(left.shape, np.nan, np.float32), outside, np.zeros_like(left))
+    disparities = task.step.disparities
+    margin = disparities // 2 + _SLACK_PX
+    wide = Window(window.row0, window.row1, window.column0 - margin, window.column1 + margin)
+    low, high = task.range_px
+    if task.before is None:
+        prior = np.full(wide.shape, (low + high) / 2, np.float32)
+    else:
+        finer = task.before_level != task.step.level
+        prior = prior_of(task.before, wide, finer=finer, otherwise=(low + high) / (4 if finer else 2))
+        np.clip(prior, low, high, out=prior)
+    right = resample_right(
+        task.right, prior, wide.row0, wide.column0, y_parallax=task.y_parallax, level=task.step.level
+    )
+    if least_texture_sd is None:
+        left_validity = no_data(left, Validity.NO_DATA_LEFT)
+        right_validity = no_data(right, Validity.NO_DATA_RIGHT)
+    else:
+        left_validity, right_validity = (
+            picture_validity(image, flag, least_texture_sd=least_texture_sd, saturated_from=saturated_from)
+            for image, flag in ((left, Validity.NO_DATA_LEFT), (right, Validity.NO_DATA_RIGHT))
+        )
+    found = aggregate_costs(
+        left_census(left),
+        right_census(right),
+        disparities=disparities,
+        small_step=task.small_step,
+        large_step=task.large_step,
+    )
+    result = select_disparities(found, prior, left_validity=left_validity, right_validity=right_validity)
+    doubtful = result.validity if least_texture_sd is not None else result.validity & ~np.uint8(Validity.AT_RANGE_EDGE)
+    result.disparity[doubtful != 0] = np.nan
+    return result
+
+
+def _cleaned(
+    tile: DisparityMap,
+    *,
+    largest_speckle_px: int,
+    speckle_step_px: float,
+) -> DisparityMap:
+    """Median of 5 x 5, islands masked, disparities rounded."""
+    disparity = median_of_given(tile.disparity)
+    islands = speckles(disparity, largest_speckle_px=largest_speckle_px, speckle_step_px=speckle_step_px)
+    disparity[islands] = np.nan
+    np.rint(disparity * FRACTIONS, out=disparity)
+    disparity /= FRACTIONS
+    validity = tile.validity | islands.view(np.uint8) * np.uint8(Validity.SPECKLE)
+    return DisparityMap(disparity, validity, tile.confidence)
+
+
+def strip_alignment_px(span_px: float) -> int:
+    """Rows of which a strip should begin at a multiple, so that its pyramid is that of the whole picture."""
+    return 1 << plan_passes(span_px)[0].level

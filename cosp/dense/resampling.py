@@ -1,0 +1,167 @@
+"""The right picture brought onto the left one with what is known so far, and that knowledge made whole and smooth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cosp.arrays import ByteArray, Float32Array
+from cosp.dense import kernels
+from cosp.imaging.windows import Window
+
+_CONTEXT_PX = 8  # of the coarser level, that a prior looks beyond its window
+
+
+@dataclass(frozen=True)
+class SmoothField:
+    """A quantity that varies slowly over a picture, given at nodes and bilinear between them.
+
+    values : (nodes down, nodes across) array, finite
+    first_row, first_column : pixel of node (0, 0)
+    row_step, column_step : pixels from node to node
+    """
+
+    values: Float32Array
+    first_row: float
+    first_column: float
+    row_step: float
+    column_step: float
+
+    def moved(self, rows: float, columns: float) -> SmoothField:
+        """The same field for a picture that begins `rows` and `columns` further on."""
+        return SmoothField(
+            self.values, self.first_row - rows, self.first_column - columns, self.row_step, self.column_step
+        )
+
+
+def resample_right(
+    right: ByteArray, prior: Float32Array, first_row: int, first_column: int, *, y_parallax: SmoothField, level: int
+) -> ByteArray:
+    """Right picture as it would look had it no disparity but what `prior` does not know; 0 where it has no data.
+
+    Parameters
+    ----------
+    right : (rows, columns) array
+        Whole right picture at this level of the pyramid.
+    prior : (tile rows, tile columns) array, px of this level
+        Disparity of the tile whose first pixel is (first_row, first_column) of the left picture.
+    y_parallax : SmoothField, px of level 0
+        Right row minus left row.
+    """
+    scale = 2.0**-level
+    lowest, highest = float(y_parallax.values.min()) * scale, float(y_parallax.values.max()) * scale
+    window = Window(
+        max(int(np.floor(first_row + lowest)) - 2, 0),
+        min(int(np.ceil(first_row + prior.shape[0] + highest)) + 2, right.shape[0]),
+        max(int(np.floor(first_column + float(prior.min()))) - 2, 0),
+        min(int(np.ceil(first_column + prior.shape[1] + float(prior.max()))) + 2, right.shape[1]),
+    )
+    if window.row1 <= window.row0 or window.column1 <= window.column0:
+        return np.zeros(prior.shape, np.uint8)
+    map_x, map_y = np.empty_like(prior), np.empty_like(prior)
+    place = (
+        (first_row / scale - y_parallax.first_row) / y_parallax.row_step,
+        (first_column / scale - y_parallax.first_column) / y_parallax.column_step,
+        1 / scale / y_parallax.row_step,
+        1 / scale / y_parallax.column_step,
+    )
+    kernels.warp_maps(
+        prior,
+        y_parallax.values,
+        place,
+        scale,
+        float(first_column - window.column0),
+        float(first_row - window.row0),
+        map_x,
+        map_y,
+    )
+    source = np.ascontiguousarray(right[window.slices])
+    # Linear: as accurate here as cubic, quicker, and what has data never comes out as 0.
+    return np.asarray(cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), np.uint8)
+
+
+def picture_pyramid(image: ByteArray, levels: int) -> list[ByteArray]:
+    """Picture at full size, half size and so on: pixel i of one level lies on pixel 2 i of the one before.
+
+    What has no data (0) takes no part in the means and stays 0 where it prevails.
+    """
+    pyramid = [image]
+    for _ in range(levels):
+        finer = pyramid[-1]
+        coarser = np.asarray(cv2.pyrDown(finer), np.uint8)
+        seen = cv2.pyrDown(cv2.threshold(finer, 0, 255, cv2.THRESH_BINARY)[1])
+        if seen.min() < 255:
+            mixed = np.nonzero((seen < 255) & (seen >= 128))
+            means = coarser[mixed] * (np.float32(255) / seen[mixed])
+            coarser[seen < 128] = 0
+            coarser[mixed] = np.clip(np.rint(means), 1, 255)
+        pyramid.append(coarser)
+    return pyramid
+
+
+def fill_holes(values: Float32Array) -> Float32Array:
+    """Values with their holes (NaN) closed smoothly from around, by halving until none is left and doubling again."""
+    levels = [values.copy()]
+    missing = int(np.isnan(values).sum())
+    if missing == values.size:
+        raise ValueError("there is no value to fill holes from")
+    while missing:
+        coarser, missing = kernels.halve(levels[-1])
+        levels.append(coarser)
+    for finer, coarser in zip(levels[-2::-1], levels[:0:-1], strict=True):
+        kernels.fill_from(finer, coarser)
+    return levels[0]
+
+
+def median_of_given(disparity: Float32Array) -> Float32Array:
+    """5 x 5 median of disparity; holes stay holes."""
+    if np.isnan(disparity).all():
+        return disparity
+    median = np.asarray(cv2.medianBlur(fill_holes(disparity), 5), np.float32)
+    median[np.isnan(disparity)] = np.nan
+    return median
+
+
+def prior_of(disparity: Float32Array, window: Window, *, finer: bool, otherwise: float) -> Float32Array:
+    """What a pass knows beforehand in a window: the disparity of the pass before, whole, without outliers and smooth.
+
+    Parameters
+    ----------
+    disparity : (rows, columns) array, px of its own level
+        Whole result of the pass before.
+    window : Window
+        In pixels of the level to come; may reach beyond the picture, where the outermost values go on.
+    finer : bool
+        The level to come is the next finer one, so that numbers double too.
+    otherwise : float
+        What to take where the pass before found nothing at all, in pixels of its level.
+    """
+    ratio = 2 if finer else 1
+    around = Window(
+        min(max(window.row0 // ratio - _CONTEXT_PX, 0), disparity.shape[0] - 1),
+        max(min(-(-window.row1 // ratio) + _CONTEXT_PX, disparity.shape[0]), 1),
+        min(max(window.column0 // ratio - _CONTEXT_PX, 0), disparity.shape[1] - 1),
+        max(min(-(-window.column1 // ratio) + _CONTEXT_PX, disparity.shape[1]), 1),
+    )
+    known = disparity[around.slices]
+    if np.isnan(known).all():
+        return np.full(window.shape, otherwise * ratio, np.float32)
+    smooth = cv2.GaussianBlur(cv2.medianBlur(fill_holes(known), 5), (0, 0), 1.0)
+    to_known = np.array(
+        [[1 / ratio, 0, window.column0 / ratio - around.column0], [0, 1 / ratio, window.row0 / ratio - around.row0]]
+    )
+    rows, columns = window.shape
+    enlarged = np.asarray(
+        cv2.warpAffine(
+            smooth,
+            to_known,
+            (columns, rows),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        ),
+        np.float32,
+    )
+    enlarged *= ratio
+    return enlarged

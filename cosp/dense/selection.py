@@ -1,0 +1,59 @@
+"""From the winners of the aggregation to disparities: sub-pixel, checked from the right, with what was known before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosp.arrays import ByteArray, Float32Array
+from cosp.dense import kernels
+from cosp.dense.aggregation import Winners
+from cosp.dense.validity import Validity
+
+
+@dataclass(frozen=True)
+class DisparityMap:
+    """Disparity of every left pixel, why it is missing, and how far ahead of the others it was.
+
+    disparity : (rows, columns) array, px; right column = left column + disparity; NaN where validity is not 0
+    validity : (rows, columns) array of `Validity` bits
+    confidence : (rows, columns) array, 0 (the runner-up costs the same) to 255 (the runner-up costs infinitely more)
+    """
+
+    disparity: Float32Array
+    validity: ByteArray
+    confidence: ByteArray
+
+
+def select_disparities(
+    found: Winners, prior: Float32Array, *, left_validity: ByteArray, right_validity: ByteArray
+) -> DisparityMap:
+    """Disparities of one picture, every one given, with validity bits for the doubtful ones.
+
+    The right picture was resampled by `prior`, so what the winners tell is the disparity k that is left over:
+    d(x) = k + prior(x + k). A winner counts as inconsistent where the right pixel it points to prefers another left
+    pixel, more than one px away ([Hirschmuller2008] section 2.3).
+
+    Parameters
+    ----------
+    prior : (rows, columns + 2 margin) array, px
+        Disparity with which the right picture was resampled, going on past the left picture's sides.
+    left_validity, right_validity : arrays of the shapes of the left and of the resampled right picture
+        Bits that the pictures alone decide.
+    """
+    shape = found.winners.shape
+    result = DisparityMap(np.empty(shape, np.float32), left_validity.copy(), np.empty(shape, np.uint8))
+    kernels.select(
+        found.winners,
+        found.costs,
+        found.right_winners,
+        prior,
+        right_validity,
+        int(Validity.INCONSISTENT),
+        int(Validity.AT_RANGE_EDGE),
+        result.disparity,
+        result.validity,
+        result.confidence,
+    )
+    return result

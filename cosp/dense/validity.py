@@ -1,0 +1,95 @@
+"""Meaning of each bit of the validity, and the tests behind those that a picture or a disparity map decides alone."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import Any
+
+import numpy as np
+
+from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from cosp.dense import kernels
+from cosp.geometry.statistics import summarise
+
+TEXTURE_WINDOW_PX = 9
+"""Side of the window in which texture is measured: the census looks as far."""
+
+
+class Validity(IntFlag):
+    """Why a pixel has no disparity; 0 where it has one."""
+
+    NO_DATA_LEFT = 1
+    NO_DATA_RIGHT = 2  # the match lies outside the right picture
+    INCONSISTENT = 4  # the right picture prefers another match: occluded, or ambiguous
+    LOW_TEXTURE = 8
+    SATURATED = 16
+    AT_RANGE_EDGE = 32  # the cheapest disparity was the first or last that was searched
+    SPECKLE = 64
+
+
+def no_data(image: ByteArray, flag: Validity) -> ByteArray:
+    """`flag` where the picture is 0."""
+    bits: ByteArray = (image == 0).view(np.uint8) * np.uint8(flag)
+    return bits
+
+
+def picture_validity(
+    image: ByteArray, no_data_flag: Validity, *, least_texture_sd: float, saturated_from: int
+) -> ByteArray:
+    """Bits that one picture decides alone.
+
+    LOW_TEXTURE where the grey values of the surrounding window scatter by less than `least_texture_sd` (standard
+    deviation), SATURATED where most of them are at least `saturated_from`, and the flag given where the picture is 0.
+    """
+    bits = no_data(image, no_data_flag)
+    kernels.flag_windows(
+        image,
+        TEXTURE_WINDOW_PX // 2,
+        least_texture_sd,
+        saturated_from,
+        int(Validity.LOW_TEXTURE),
+        int(Validity.SATURATED),
+        bits,
+    )
+    return bits
+
+
+def speckles(disparity: Float32Array, *, largest_speckle_px: int, speckle_step_px: float) -> BoolArray:
+    """Where a disparity belongs to an island of at most `largest_speckle_px` pixels.
+
+    An island ends where disparity changes by more than `speckle_step_px` from pixel to pixel, or is missing.
+    """
+    found = np.empty(disparity.shape, np.bool_)
+    kernels.islands(disparity, speckle_step_px, largest_speckle_px, found)
+    return found
+
+
+def summarise_disparity(validity_counts: IntArray, disparity_px: FloatArray) -> dict[str, Any]:
+    """How much of a pair was matched, why the rest was not, and how disparity is distributed.
+
+    Parameters
+    ----------
+    validity_counts : (256,) array
+        Number of pixels with each value of validity.
+    disparity_px : array
+        All disparities or a fair sample of them, with NaN.
+
+    Returns
+    -------
+    dict
+        `density`: share of pixels with a disparity among those where both pictures have data; `share_by_bit`: share of
+        all pixels in which each bit is set; `disparity_px`: robust statistics.
+    """
+    values = np.arange(256)
+    outside = (values & (Validity.NO_DATA_LEFT | Validity.NO_DATA_RIGHT)) != 0
+    total, seen = int(validity_counts.sum()), int(validity_counts[~outside].sum())
+    return {
+        "pixels": total,
+        "density": int(validity_counts[0]) / seen if seen else float("nan"),
+        "share_by_bit": {
+            bit.name.lower(): int(validity_counts[(values & bit) != 0].sum()) / max(total, 1)
+            for bit in Validity
+            if bit.name is not None
+        },
+        "disparity_px": summarise(disparity_px),
+    }

@@ -1,0 +1,142 @@
+"""The compiled loops: polynomials of many points, and film points of the pixels of a rectified image."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from cosp.arrays import FloatArray
+
+
+@njit(nogil=True, cache=True)
+def evaluate(coefficients: FloatArray, u: FloatArray, v: FloatArray, values: FloatArray) -> None:
+    """Write sum c_ij T_i(u) T_j(v) of points (N,) into values (N,); Chebyshev recurrences."""
+    count_u, count_v = coefficients.shape
+    basis_v = np.empty(max(count_v, 2))
+    for n in range(u.size):
+        basis_v[0] = 1.0
+        basis_v[1] = v[n]
+        for j in range(2, count_v):
+            basis_v[j] = 2.0 * v[n] * basis_v[j - 1] - basis_v[j - 2]
+        # Clenshaw's sum along u
+        b1 = 0.0
+        b2 = 0.0
+        for i in range(count_u - 1, -1, -1):
+            c = 0.0
+            for j in range(count_v):
+                c += coefficients[i, j] * basis_v[j]
+            b1, b2 = c + 2.0 * u[n] * b1 - b2, b1
+        values[n] = b1 - u[n] * b2
+
+
+@njit(nogil=True, cache=True)
+def pixels_to_plane(
+    powers: FloatArray,
+    rows: FloatArray,
+    columns: FloatArray,
+    row_scale: tuple[float, float],
+    column_scale: tuple[float, float],
+    limit: float,
+    affine: FloatArray,
+    outside: float,
+    first: FloatArray,
+    second: FloatArray,
+) -> None:
+    """Places in a plane (film, or pixels of a film raster) of places of a rectified image.
+
+    The inverse polynomial is collected once per whole row into a polynomial in u and its derivative along the row
+    coordinate; inside a row that leaves a few multiplications per pixel. What comes out depends on the place alone,
+    not on how a picture was cut.
+
+    powers : (m, n) coefficients of v / half_v: powers of u along the first axis, Chebyshev along the second (rows).
+    rows : (H, W), or (H, 1) where a line is on one row
+    columns : (H, W) places in the rectified image.
+    row_scale, column_scale : (value at pixel 0, change per pixel) of the scaled row coordinate and of scaled u.
+    affine : (2, 3) plane coordinates of (u scaled, v scaled, 1).
+    first, second : (H, W) results; `outside` beyond the limit of the scaled coordinates.
+    """
+    count_u, count_v = powers.shape
+    height, width = columns.shape
+    value = np.empty(count_u)
+    slope = np.empty(count_u)
+    basis = np.empty(max(count_v, 2))
+    change = np.empty(max(count_v, 2))
+    u = np.empty(width)
+    reached = np.empty(width)
+    v = np.empty(width)
+    dv = np.empty(width)
+    a_u, a_v, a_1 = affine[0]
+    b_u, b_v, b_1 = affine[1]
+    collected = np.nan
+    for y in range(height):
+        for x in range(width):
+            u[x] = column_scale[0] + column_scale[1] * columns[y, x]
+        start = 0
+        while start < width:
+            base = np.floor(rows[y, start if rows.shape[1] > 1 else 0] + 0.5)
+            if base != collected:
+                _collect(powers, row_scale, base, basis, change, value, slope)
+                collected = base
+            stop = width
+            if rows.shape[1] > 1:
+                stop = start + 1
+                while stop < width and abs(rows[y, stop] - base) <= 0.5:
+                    stop += 1
+            # Power by power over the whole run, not pixel by pixel: that is what the vector units can do.
+            v[start:stop] = value[count_u - 1]
+            for i in range(count_u - 2, -1, -1):
+                for x in range(start, stop):
+                    v[x] = v[x] * u[x] + value[i]
+            if rows.shape[1] > 1 or rows[y, 0] != base:
+                dv[start:stop] = slope[count_u - 1]
+                for i in range(count_u - 2, -1, -1):
+                    for x in range(start, stop):
+                        dv[x] = dv[x] * u[x] + slope[i]
+                for x in range(start, stop):
+                    v[x] += dv[x] * (rows[y, x if rows.shape[1] > 1 else 0] - base)
+            start = stop
+        if rows.shape[1] > 1:
+            for x in range(width):
+                w = row_scale[0] + row_scale[1] * rows[y, x]
+                reached[x] = u[x] if abs(w) <= limit else np.inf
+        else:
+            w = row_scale[0] + row_scale[1] * rows[y, 0]
+            if abs(w) <= limit:
+                reached[:] = u
+            else:
+                reached[:] = np.inf
+        for x in range(width):
+            inside = abs(reached[x]) <= limit
+            a = a_u * u[x] + a_v * v[x] + a_1
+            b = b_u * u[x] + b_v * v[x] + b_1
+            first[y, x] = a if inside else outside
+            second[y, x] = b if inside else outside
+
+
+@njit(nogil=True, cache=True)
+def _collect(
+    powers: FloatArray,
+    row_scale: tuple[float, float],
+    row: float,
+    basis: FloatArray,
+    change: FloatArray,
+    value: FloatArray,
+    slope: FloatArray,
+) -> None:
+    """Write the polynomial in u that holds on one row, and its derivative per row, into value and slope."""
+    w = row_scale[0] + row_scale[1] * row
+    basis[0] = 1.0
+    basis[1] = w
+    change[0] = 0.0
+    change[1] = 1.0
+    for j in range(2, powers.shape[1]):
+        basis[j] = 2.0 * w * basis[j - 1] - basis[j - 2]
+        change[j] = 2.0 * basis[j - 1] + 2.0 * w * change[j - 1] - change[j - 2]
+    for i in range(powers.shape[0]):
+        a = 0.0
+        b = 0.0
+        for j in range(powers.shape[1]):
+            a += powers[i, j] * basis[j]
+            b += powers[i, j] * change[j]
+        value[i] = a
+        slope[i] = b * row_scale[1]

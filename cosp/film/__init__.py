@@ -1,0 +1,1 @@
+"""The film: its parts joined, its format found, its bending taken out."""

@@ -1,0 +1,251 @@
+"""Bending of the film across its length, and the map from straight film to the joined film."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from scipy.interpolate import make_smoothing_spline
+
+from cosp.arrays import ByteArray, FloatArray
+from cosp.film.exposure import Exposure
+from cosp.film.stripes import Trace
+from cosp.geometry.grids import PixelGrid
+from cosp.geometry.robust import tukey_weights
+from cosp.geometry.statistics import nmad
+from cosp.imaging.resampling import sample
+from cosp.imaging.windows import Window
+
+
+@dataclass(frozen=True)
+class Bending:
+    """Displacement across the film, as two curves along it, linear between them.
+
+    Parameters
+    ----------
+    source : "stripes", "edges" or "none"
+        What it was measured from.
+    sd_mm : float
+        Standard deviation of the curves; for "none" that of the straight line assumed.
+    x_mm : (N,) floats
+    dy_top_mm, dy_bottom_mm : (N,) floats
+        Where the line lies above its straight place.
+    y_top_mm, y_bottom_mm : float
+        Straight places of the two lines.
+    """
+
+    KIND: ClassVar[str] = "bending"
+    VERSION: ClassVar[int] = 1
+
+    source: Literal["stripes", "edges", "none"]
+    sd_mm: float
+    x_mm: tuple[float, ...]
+    dy_top_mm: tuple[float, ...]
+    dy_bottom_mm: tuple[float, ...]
+    y_top_mm: float
+    y_bottom_mm: float
+
+    def bent(self, xy_mm: FloatArray) -> FloatArray:
+        """Where points (..., 2) of the straight film lie on the film as it was scanned, mm."""
+        xy_mm = np.asarray(xy_mm, float)
+        x, y = xy_mm[..., 0], xy_mm[..., 1]
+        top = np.interp(x, self.x_mm, self.dy_top_mm)
+        bottom = np.interp(x, self.x_mm, self.dy_bottom_mm)
+        share = (y - self.y_bottom_mm) / (self.y_top_mm - self.y_bottom_mm)
+        return np.stack([x, y + bottom + share * (top - bottom)], axis=-1)
+
+
+def no_bending(exposure: Exposure, *, sd_mm: float) -> Bending:
+    """A film taken to be straight, with the standard deviation that this assumption deserves."""
+    half, width = exposure.half_length_mm, exposure.half_width_mm
+    return Bending("none", sd_mm, (-half, half), (0.0, 0.0), (0.0, 0.0), width, -width)
+
+
+def choose_bending(
+    exposure: Exposure,
+    *,
+    stripes: Sequence[Trace],
+    edges: Sequence[Trace],
+    min_share: float,
+    max_noise_mm: float,
+    step_mm: float,
+    smoothing_mm: float,
+    edge_smoothing_mm: float,
+    single_sd_mm: float,
+    none_sd_mm: float,
+) -> Bending:
+    """Bending from the stripes where they are usable, else from both long edges of the format, else none.
+
+    Parameters
+    ----------
+    exposure : Exposure
+    stripes, edges : Trace of each side that was traced
+    min_share : float
+        Share of the length over which a line must be seen.
+    max_noise_mm : float
+        Largest noise of a line's places.
+    step_mm : float
+        Spacing of the curves' places.
+    smoothing_mm, edge_smoothing_mm : float
+        Shortest wavelength that the curves follow, for stripes and for edges.
+    single_sd_mm : float
+        Standard deviation of the curve of a missing stripe.
+    none_sd_mm : float
+        Standard deviation of a film taken to be straight.
+    """
+
+    def usable(traces: Sequence[Trace], side: str) -> Trace | None:
+        kept = [t for t in traces if t.side == side and t.share >= min_share and t.noise_mm <= max_noise_mm]
+        return kept[0] if kept else None
+
+    top, bottom = usable(stripes, "top"), usable(stripes, "bottom")
+    if top is not None or bottom is not None:
+        return bending_from_traces(
+            top, bottom, source="stripes", step_mm=step_mm, smoothing_mm=smoothing_mm, single_sd_mm=single_sd_mm
+        )
+    top, bottom = usable(edges, "top"), usable(edges, "bottom")
+    if top is not None and bottom is not None:
+        measured = bending_from_traces(
+            top, bottom, source="edges", step_mm=step_mm, smoothing_mm=edge_smoothing_mm, single_sd_mm=single_sd_mm
+        )
+        # An edge that is rougher than the film is likely to be bent says nothing.
+        if measured.sd_mm < none_sd_mm:
+            return measured
+    return no_bending(exposure, sd_mm=none_sd_mm)
+
+
+def bending_from_traces(
+    top: Trace | None,
+    bottom: Trace | None,
+    *,
+    source: Literal["stripes", "edges"],
+    step_mm: float,
+    smoothing_mm: float,
+    single_sd_mm: float,
+) -> Bending:
+    """Smooth curves through the traces of one or two lines.
+
+    Tilt stays in the curves, so that both lines come out along the film's axis; so does the mean, where there are two
+    lines: the axis lies midway between them. With one line alone the other side is given the same curve.
+
+    Parameters
+    ----------
+    top, bottom : Trace or None
+        At least one; None where a line is not usable.
+    source : str
+    step_mm : float
+        Spacing of the curves' places.
+    smoothing_mm : float
+        Wavelength below which the curves follow nothing: that is noise of the traces.
+    single_sd_mm : float
+        Standard deviation of the missing curve where there is one line only.
+    """
+    traces = [trace for trace in (top, bottom) if trace is not None]
+    low = min(float(trace.x_mm[0]) for trace in traces)
+    high = max(float(trace.x_mm[-1]) for trace in traces)
+    x = np.linspace(low, high, max(2, round((high - low) / step_mm) + 1))
+    fits = [_smooth(trace, x, smoothing_mm) for trace in traces]
+    (curve_top, sd_top), (curve_bottom, sd_bottom) = fits if len(fits) == 2 else fits * 2
+    mean_top, mean_bottom = float(curve_top.mean()), float(curve_bottom.mean())
+    sd = float(np.hypot(sd_top, sd_bottom) / np.sqrt(2.0))
+    if len(traces) == 1:
+        sd = float(np.hypot(sd, single_sd_mm))
+        mean_top, mean_bottom = (mean_top, -mean_top) if top is not None else (-mean_bottom, mean_bottom)
+    offset = (mean_top + mean_bottom) / 2
+    return Bending(
+        source=source,
+        sd_mm=sd,
+        x_mm=tuple(x.tolist()),
+        dy_top_mm=tuple((curve_top - curve_top.mean() + offset).tolist()),
+        dy_bottom_mm=tuple((curve_bottom - curve_bottom.mean() + offset).tolist()),
+        y_top_mm=mean_top - offset,
+        y_bottom_mm=mean_bottom - offset,
+    )
+
+
+def _smooth(trace: Trace, x_mm: FloatArray, smoothing_mm: float) -> tuple[FloatArray, float]:
+    """Curve at `x_mm` and its standard deviation; gaps are bridged, ends continued straight."""
+    x, y = trace.x_mm[trace.seen], trace.y_mm[trace.seen]
+    centre = float(x.mean())
+    # The penalised spline damps waves of angular frequency k by 1 / (1 + lam k^4 spacing): half at this wavelength.
+    spacing = float(np.median(np.diff(x)))
+    lam = (smoothing_mm / (2 * np.pi)) ** 4 / spacing
+    weights = np.ones_like(x)
+    for _ in range(4):
+        spline = make_smoothing_spline(x - centre, y, w=np.maximum(weights, 1e-3), lam=lam)
+        residual = y - spline(x - centre)
+        scale = max(nmad(residual), 1e-6)
+        weights = tukey_weights(residual / scale)
+    # Places within half a wavelength share one value of the curve.
+    independent = max(1.0, smoothing_mm / 2 / spacing * trace.share)
+    return np.asarray(spline(x_mm - centre)), float(scale / np.sqrt(independent))
+
+
+def film_grid(exposure: Exposure, *, half_length_mm: float, half_width_mm: float) -> PixelGrid:
+    """Grid of the straight film, centred on the format, x to the right and y up, pixels of the joined film."""
+    p = exposure.pixel_mm
+    columns, rows = 2 * int(half_length_mm / p), 2 * int(half_width_mm / p)
+    return PixelGrid(-(columns - 1) / 2 * p, (rows - 1) / 2 * p, p, -p, (rows, columns))
+
+
+def joined_pixels(
+    xy_mm: FloatArray, exposure: Exposure, bending: Bending, *, turned: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Rows and columns in the joined film of points (..., 2) of the straight film.
+
+    `turned`: the straight film is the scanned one turned by 180 degrees, as aft films have to be.
+    """
+    xy_mm = np.asarray(xy_mm, float)
+    return exposure.pixels(bending.bent(-xy_mm if turned else xy_mm))
+
+
+def joined_window(
+    grid: PixelGrid, window: Window, exposure: Exposure, bending: Bending, shape: tuple[int, int], *, turned: bool
+) -> Window:
+    """Window of the joined film (of the given shape) that a window of the straight film is made from."""
+    lattice_rows = np.unique(np.linspace(window.row0, window.row1 - 1, 9).round())
+    lattice_columns = np.unique(np.linspace(window.column0, window.column1 - 1, 65).round())
+    points = grid.points(lattice_rows[:, None], lattice_columns[None, :])
+    rows, columns = joined_pixels(points, exposure, bending, turned=turned)
+    # Bicubic needs two pixels; the curves bend by far less than two more between lattice points.
+    row0, column0 = (int(np.clip(v.min() - 5, 0, n - 1)) for v, n in zip((rows, columns), shape, strict=True))
+    row1, column1 = (int(np.clip(v.max() + 6, 1, n)) for v, n in zip((rows, columns), shape, strict=True))
+    return Window(row0, max(row1, row0 + 1), column0, max(column1, column0 + 1))
+
+
+def straighten(
+    image: ByteArray,
+    source: Window,
+    grid: PixelGrid,
+    window: Window,
+    exposure: Exposure,
+    bending: Bending,
+    *,
+    turned: bool,
+) -> ByteArray:
+    """A window of the straight film, resampled once (bicubic) from a window of the joined film; 0 outside.
+
+    Parameters
+    ----------
+    image : array of the shape of `source`
+    source : Window
+        Of the joined film, see `joined_window`.
+    grid : PixelGrid
+        Of the straight film.
+    window : Window
+        Of the straight film.
+    exposure, bending : records
+    turned : bool
+        Turn by 180 degrees.
+    """
+    # For each column of the straight film the place is linear along the column: two of its points give the others.
+    columns_here = np.arange(window.column0, window.column1)
+    first, last = (grid.points(np.array(row), columns_here) for row in (window.row0, window.row1 - 1))
+    begin, end = (joined_pixels(points, exposure, bending, turned=turned) for points in (first, last))
+    share = np.linspace(0.0, 1.0, window.row1 - window.row0, dtype=np.float32)[:, None]
+    places = []
+    for start, stop, offset in zip(begin, end, (source.row0, source.column0), strict=True):
+        places.append((start - offset).astype(np.float32) + share * (stop - start).astype(np.float32))
+    return np.asarray(sample(image, places[0], places[1], interpolation="cubic"), np.uint8)

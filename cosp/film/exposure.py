@@ -1,0 +1,285 @@
+"""The exposed area of a film: where the format lies, how it is tilted, how sure that is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
+from cosp.errors import InputError
+from cosp.geometry.robust import tukey_weights
+from cosp.geometry.statistics import nmad
+from cosp.imaging.resampling import sample
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """The exposed area in the pixels of the joined film.
+
+    Parameters
+    ----------
+    pixel_mm : float
+        Size of a pixel of the joined film.
+    centre_px : (x, y)
+        Column and row of the centre of format.
+    tilt_deg : float
+        Direction of the format's long axis; positive turns columns towards rows.
+    half_length_mm, half_width_mm : float
+        Of the area found.
+    centre_sd_mm : (x, y)
+        Standard deviation of the centre along and across the film.
+    ends_found : (left, right)
+        Whether the end of the format is seen; an end that is not is taken from the other end and the nominal length.
+    edges_found : (top, bottom)
+        Share of the length over which each long edge is seen.
+    """
+
+    KIND: ClassVar[str] = "exposure"
+    VERSION: ClassVar[int] = 1
+
+    pixel_mm: float
+    centre_px: tuple[float, float]
+    tilt_deg: float
+    half_length_mm: float
+    half_width_mm: float
+    centre_sd_mm: tuple[float, float]
+    ends_found: tuple[bool, bool]
+    edges_found: tuple[float, float]
+
+    def pixels(self, xy_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rows and columns in the joined film of points (..., 2) of the film, mm, x to the right and y up."""
+        xy_mm = np.asarray(xy_mm, float)
+        c, s = np.cos(np.radians(self.tilt_deg)), np.sin(np.radians(self.tilt_deg))
+        right, down = xy_mm[..., 0] / self.pixel_mm, -xy_mm[..., 1] / self.pixel_mm
+        return self.centre_px[1] + s * right + c * down, self.centre_px[0] + c * right - s * down
+
+
+# Step of grey that counts in full as the edge of a picture; brighter steps count no more, so that snow rules nothing.
+_FULL_STEP = 40.0
+_TILT_LIMIT_DEG = 1.0
+# Lines thinner than this are no picture; stripes are a tenth of a millimetre and lie 0.6 mm and more beside it.
+LINE_MM = 0.55
+
+
+def find_exposure(
+    image: ByteArray,
+    *,
+    pixel_mm: float,
+    factor: int,
+    length_mm: float,
+    width_mm: float,
+    length_tolerance: float,
+    width_tolerance: float,
+    valid: BoolArray | None = None,
+) -> Exposure:
+    """The exposed area, from the steps of grey at the four sides of the format.
+
+    A side of the format is a straight line along which the picture is brighter than the film beside it. Lines are
+    found as pairs at the nominal distance from each other, which leaves out the edges of the film, the scanner's
+    border, marks and titling; where the picture is as dark as the film (night, sea) the rest of the line and the other
+    side of the pair carry it.
+
+    Parameters
+    ----------
+    image : (rows, columns) uint8 array
+        The joined film, reduced.
+    pixel_mm : float
+        Size of a pixel of the full joined film.
+    factor : int
+        Full pixels per pixel of `image`.
+    length_mm, width_mm : float
+        Nominal format.
+    length_tolerance, width_tolerance : float
+        Relative deviation from it that is possible.
+    valid : (rows, columns) bool array, optional
+        Pixels that may be looked at.
+
+    Raises
+    ------
+    InputError
+        Where nothing looks like the long sides of the format.
+    """
+    step_mm = pixel_mm * factor
+    valid = image > 0 if valid is None else valid
+    # Thin bright lines beside the picture (stripes, scratches) would look like its edge: an opening takes them away.
+    across = _steps(without_lines(image, step_mm), valid, axis=0)
+    tilt, top, bottom = _long_sides(across, step_mm, width_mm, width_tolerance, length_mm)
+    top_line, top_share, top_sd = _fit_line(across, tilt, top, reach=1.5 / step_mm)
+    bottom_line, bottom_share, bottom_sd = _fit_line(-across, tilt, bottom, reach=1.5 / step_mm)
+    if max(top_share, bottom_share) < 0.1:
+        raise InputError(
+            f"the long sides of the format are seen over {100 * top_share:.0f} % and {100 * bottom_share:.0f} % of the "
+            "film; a tenth of one of them is needed"
+        )
+    # Columns refer to the middle of the image; rows = line[0] + line[1] (column - middle).
+    middle = (image.shape[1] - 1) / 2
+    slope = float(np.average([top_line[1], bottom_line[1]], weights=[top_share + 0.01, bottom_share + 0.01]))
+    upright = _upright(image, slope, top_line[0], bottom_line[0])
+    upright_valid = _upright(valid.astype(np.uint8) * 255, slope, top_line[0], bottom_line[0]) > 250
+    left, right, ends, end_sd = _short_sides(upright, upright_valid, step_mm, length_mm, length_tolerance)
+
+    half_width = (bottom_line[0] - top_line[0]) / 2 * np.cos(np.arctan(slope))
+    along = (left + right) / 2 - middle
+    c, s = np.cos(np.arctan(slope)), np.sin(np.arctan(slope))
+    origin = np.array([middle, (top_line[0] + bottom_line[0]) / 2])
+    centre = origin + along * np.array([c, s])
+    full = (centre + 0.5) * factor - 0.5
+    return Exposure(
+        pixel_mm=pixel_mm,
+        centre_px=(float(full[0]), float(full[1])),
+        tilt_deg=float(np.degrees(np.arctan(slope))),
+        half_length_mm=float((right - left) / 2 * step_mm),
+        half_width_mm=float(half_width * step_mm),
+        centre_sd_mm=(float(end_sd * step_mm), float(np.hypot(top_sd, bottom_sd) / 2 * step_mm)),
+        ends_found=ends,
+        edges_found=(top_share, bottom_share),
+    )
+
+
+def without_lines(image: NDArray[Any], step_mm: float) -> NDArray[Any]:
+    """The image without bright lines along its rows that are thinner than `LINE_MM`, by a grey opening."""
+    thickness = max(3, round(LINE_MM / step_mm))
+    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_OPEN, np.ones((thickness, 1), np.uint8)))
+
+
+def _steps(image: ByteArray, valid: BoolArray, *, axis: int) -> Float32Array:
+    """Clipped step of grey between pixel i and i + 1 along an axis, of means over two pixels; 0 where not valid."""
+    values = np.moveaxis(image.astype(np.float32), axis, 0)
+    good = np.moveaxis(valid, axis, 0)
+    step = np.zeros_like(values)
+    step[1:-2] = (values[2:-1] + values[3:] - values[1:-2] - values[:-3]) / 2
+    seen = np.zeros_like(good)
+    seen[1:-2] = good[2:-1] & good[3:] & good[1:-2] & good[:-3]
+    return np.asarray(np.moveaxis(np.clip(np.where(seen, step, 0.0), -_FULL_STEP, _FULL_STEP), 0, axis))
+
+
+def _long_sides(
+    across: Float32Array, step_mm: float, width_mm: float, tolerance: float, length_mm: float
+) -> tuple[float, float, float]:
+    """Slope and the rows (at the middle column) of the two lines that look most like the long sides."""
+    rows, columns = across.shape
+    block = max(1, round(5.0 / step_mm))
+    count = columns // block
+    blocks = across[:, : count * block].reshape(rows, count, block).mean(axis=2)
+    # A block counts with the square root of its step: many weak places outweigh a few strong ones.
+    blocks = np.sign(blocks) * np.sqrt(np.abs(blocks))
+    x = (np.arange(count) + 0.5) * block - 0.5 - (columns - 1) / 2
+    best = (-np.inf, 0.0, 0.0, 0.0)
+    limit = np.tan(np.radians(_TILT_LIMIT_DEG))
+    low, high = (int(width_mm * (1 + sign * tolerance) / step_mm) for sign in (-1, 1))
+    for slope in np.arange(-limit, limit, 0.5 * step_mm / (length_mm / 2)):
+        shift = np.rint(slope * x).astype(int)
+        source = np.arange(rows)[:, None] + shift
+        inside = (source >= 0) & (source < rows)
+        profile = np.where(inside, blocks[np.clip(source, 0, rows - 1), np.arange(count)], 0).sum(axis=1)
+        profile = gaussian_filter1d(profile, 0.7)
+        for distance in range(low, high + 1):
+            pair = profile[: rows - distance] - profile[distance:]
+            row = int(pair.argmax())
+            if pair[row] > best[0]:
+                best = (float(pair[row]), float(slope), float(row), float(row + distance))
+    # The step at index i lies between rows i and i + 1.
+    return best[1], best[2] + 0.5, best[3] + 0.5
+
+
+def _fit_line(
+    across: Float32Array, slope: float, row: float, *, reach: float
+) -> tuple[tuple[float, float], float, float]:
+    """Line row = p0 + p1 (column - middle) through the steps near a first line, share of columns with one, sd of p0."""
+    rows, columns = across.shape
+    width = max(2, round(reach))
+    block = max(1, columns // 400)
+    count = columns // block
+    x = (np.arange(count) + 0.5) * block - 0.5 - (columns - 1) / 2
+    line = np.array([row, slope])
+    offsets = np.arange(-width, width + 1)
+    found, weight = np.full(count, np.nan), np.zeros(count)
+    smooth = across[:, : count * block].reshape(rows, count, block).mean(axis=2)
+    for k in range(count):
+        expected = line[0] + line[1] * x[k] - 0.5
+        picked = np.rint(expected).astype(int) + offsets
+        picked = picked[(picked >= 0) & (picked < rows)]
+        step = np.maximum(smooth[picked, k], 0.0) if picked.size else np.zeros(1)
+        if step.max() > 6.0:
+            peak = int(step.argmax())
+            near = slice(max(peak - 2, 0), peak + 3)
+            found[k] = (step[near] * picked[near]).sum() / step[near].sum() + 0.5
+            weight[k] = min(float(step.max()), _FULL_STEP)
+    seen = np.isfinite(found)
+    if seen.sum() < 10:
+        return (row, slope), float(seen.mean()), width / 2
+    design = np.column_stack([np.ones(count), x])[seen]
+    target, weights = found[seen], weight[seen]
+    robust = np.ones_like(weights)
+    for _ in range(8):
+        total = np.sqrt(weights * robust)
+        line = np.linalg.lstsq(design * total[:, None], target * total, rcond=None)[0]
+        residual = target - design @ line
+        scale = max(nmad(residual[robust > 0]), 0.1)
+        robust = tukey_weights(residual / scale)
+    share = float((robust > 0.1).sum() / count)
+    return (float(line[0]), float(line[1])), share, float(scale / np.sqrt(max((robust > 0.1).sum(), 1)))
+
+
+def _upright(image: ByteArray, slope: float, top: float, bottom: float) -> ByteArray:
+    """The picture between its long sides, tilt taken out; columns stay distances from the middle column."""
+    c, s = np.cos(np.arctan(slope)), np.sin(np.arctan(slope))
+    right = np.arange(image.shape[1]) - (image.shape[1] - 1) / 2
+    half = (bottom - top) / 2 - 2.0
+    down = np.arange(-half, half + 1e-9)
+    rows = (top + bottom) / 2 + s * right[None] + c * down[:, None]
+    columns = (image.shape[1] - 1) / 2 + c * right[None] - s * down[:, None]
+    return np.asarray(sample(image, rows, columns, interpolation="linear"), np.uint8)
+
+
+def _short_sides(
+    upright: ByteArray, valid: BoolArray, step_mm: float, length_mm: float, tolerance: float
+) -> tuple[float, float, tuple[bool, bool], float]:
+    """Columns of the left and right ends, whether each was seen, standard deviation of their mean."""
+    along = _steps(upright, valid, axis=1)
+    rows, columns = along.shape
+    strength = np.sign(along) * np.sqrt(np.abs(along))
+    # An end is a step at every row: the mean over rows of the clipped step; texture inside the picture averages out.
+    profile = gaussian_filter1d(strength.mean(axis=0), 0.7)
+    # The film beyond an end is dark and even; the picture inside an end is not both.
+    level = upright.astype(np.float32)
+    spread = gaussian_filter1d(np.abs(np.diff(level, axis=1, prepend=level[:, :1])).mean(axis=0), 3.0 / step_mm)
+    low, high = (int(length_mm * (1 + sign * tolerance) / step_mm) for sign in (-1, 1))
+    high = min(high, columns - 1)
+    del spread
+    best = (-np.inf, 0.0, 0.0)
+    nominal = length_mm / step_mm
+    for distance in range(low, high + 1):
+        pair = np.maximum(profile[: columns - distance], 0) + np.maximum(-profile[distance:], 0)
+        # A weak pull to the nominal length decides where one end is not seen.
+        pair = pair - 0.3 * ((distance - nominal) / (tolerance * nominal)) ** 2
+        column = int(pair.argmax())
+        if pair[column] > best[0]:
+            best = (float(pair[column]), float(column), float(column + distance))
+    if not np.isfinite(best[0]):
+        raise InputError(
+            f"the joined film is {columns * step_mm:.0f} mm long; the format of {length_mm:.0f} mm does not fit into it"
+        )
+    ends = [_refine_end(profile, best[1]), _refine_end(-profile, best[2])]
+    seen = (ends[0][1] > 1.5, ends[1][1] > 1.5)
+    left, right = ends[0][0], ends[1][0]
+    if seen[0] and not seen[1]:
+        right = left + nominal
+    elif seen[1] and not seen[0]:
+        left = right - nominal
+    sd = {2: 0.3, 1: 0.25 * tolerance * nominal, 0: tolerance * nominal}[sum(seen)]
+    return left, right, seen, float(sd)
+
+
+def _refine_end(profile: FloatArray, column: float) -> tuple[float, float]:
+    """Column of the step to a part of a pixel and its height, sqrt of grey levels."""
+    c = int(column)
+    near = np.arange(max(c - 2, 0), min(c + 3, len(profile)))
+    weight = np.maximum(profile[near], 0)
+    height = float(weight.max())
+    return (float((near * weight).sum() / weight.sum()) + 0.5 if height > 0 else column + 0.5), height

@@ -1,0 +1,1 @@
+"""Matching and control: where film lies on the ground, ground control points, tie points."""

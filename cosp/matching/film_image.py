@@ -1,0 +1,83 @@
+"""A film that can be asked for grey values at film points, whole in memory or read by windows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosp.arrays import Float32Array, FloatArray
+from cosp.geometry.grids import PixelGrid
+from cosp.imaging.resampling import block_mean, sample
+from cosp.imaging.windows import Window
+
+# Columns of a film taken at once when it is reduced: whole rows of a 7 um film stay below 64 MB.
+_READ_COLUMNS = 8192
+_REACH_PX = 3
+
+
+@dataclass(frozen=True)
+class FilmImage:
+    """Grey values of a film on a grid of millimetres; 0 is outside the picture.
+
+    Parameters
+    ----------
+    grid : PixelGrid
+    read : function of a Window
+        Gives the pixels (rows, columns) of a window that lies inside the grid.
+    """
+
+    grid: PixelGrid
+    read: Callable[[Window], NDArray[Any]]
+
+    @classmethod
+    def from_array(cls, pixels: NDArray[Any], grid: PixelGrid) -> FilmImage:
+        """A film that is in memory."""
+        return cls(grid, lambda window: pixels[window.slices])
+
+    @property
+    def pixel_mm(self) -> float:
+        """Side of a pixel."""
+        return abs(self.grid.step_x)
+
+    def reduced(self, factor: int) -> FilmImage:
+        """The film as means of factor x factor pixels, in memory; read window by window."""
+        rows, columns = self.grid.shape
+        step = max(factor, _READ_COLUMNS // factor * factor)
+        parts = [
+            block_mean(self.read(Window(0, rows, start, min(start + step, columns))), factor)
+            for start in range(0, columns, step)
+        ]
+        return FilmImage.from_array(np.concatenate(parts, axis=1), self.grid.coarsened(factor))
+
+    def part(self, low_x_mm: float, high_x_mm: float) -> FilmImage:
+        """The film between two places along it, as far as it reaches; at least one column."""
+        columns = self.grid.shape[1]
+        _, ends = self.grid.pixels(np.array([[low_x_mm, 0.0], [high_x_mm, 0.0]]))
+        first = int(np.clip(np.floor(ends[0]), 0, columns - 1))
+        last = int(np.clip(np.ceil(ends[1]) + 1, first + 1, columns))
+        grid = self.grid.window(0, self.grid.shape[0], first, last)
+        read = self.read
+        return FilmImage(grid, lambda w: read(Window(w.row0, w.row1, w.column0 + first, w.column1 + first)))
+
+    def sample(self, film_mm: FloatArray) -> Float32Array:
+        """Grey values at film points (..., 2) in mm; NaN outside the picture."""
+        rows, columns = self.grid.pixels(film_mm)
+        shape = self.grid.shape
+        with np.errstate(invalid="ignore"):
+            inside = (rows > -0.5) & (rows < shape[0] - 0.5) & (columns > -0.5) & (columns < shape[1] - 0.5)
+        result = np.full(rows.shape, np.nan, np.float32)
+        if not inside.any():
+            return result
+        window = Window(
+            int(rows[inside].min() + 0.5), int(rows[inside].max() + 0.5) + 1,
+            int(columns[inside].min() + 0.5), int(columns[inside].max() + 0.5) + 1,
+        ).grown(_REACH_PX, shape)  # fmt: skip
+        pixels = np.asarray(self.read(window))
+        local_rows, local_columns = rows - window.row0, columns - window.column0
+        present = sample((pixels > 0).astype(np.uint8), local_rows, local_columns, interpolation="nearest")
+        values = sample(pixels.astype(np.float32), local_rows, local_columns, interpolation="cubic")
+        return np.where(inside & (present > 0), values, np.float32(np.nan)).astype(np.float32)

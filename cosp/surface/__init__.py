@@ -1,0 +1,1 @@
+"""From conjugate film points to heights: intersection, gridding, orthophoto."""

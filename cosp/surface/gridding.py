@@ -1,0 +1,139 @@
+"""Points to a raster of heights: robust, with an honest standard deviation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from pyproj import Transformer
+
+from cosp.arrays import Float32Array, FloatArray, IntArray
+from cosp.geometry.frames import LocalFrame
+from cosp.geometry.grids import PixelGrid
+from cosp.geometry.mapping import MapFrame
+from cosp.surface import kernels
+
+HALO_CELLS = 4  # what `grid_points` needs around a tile to give the heights of the whole
+
+_SLOPE_WEIGHT = 0.1  # points; holds slopes where the points lie on a line, without a say elsewhere
+_NEIGHBOURS_TO_FILL = 5  # of 8: closes holes of a cell and slits of one cell, does not grow the edge
+
+
+@dataclass(frozen=True)
+class GriddedHeights:
+    """Heights of a grid and how well they are known.
+
+    Parameters
+    ----------
+    height_m : (R, C) float32 array
+        NaN where no point lies in the cell and it is not a tiny hole.
+    sigma_m : (R, C) float32 array
+        Standard deviation of each height.
+    count : (R, C) int array
+        Points of the cell itself that were used; 0 in filled holes.
+    """
+
+    height_m: Float32Array
+    sigma_m: Float32Array
+    count: IntArray
+
+
+def grid_points(
+    points: FloatArray,
+    grid: PixelGrid,
+    *,
+    kernel_cells: float,
+    gate_sigmas: float,
+    point_sigma_m: float,
+    points_per_independent: float,
+) -> GriddedHeights:
+    """Heights at the cell centres of a grid from points on a surface.
+
+    Each height is that of a plane fitted to the points of the cell and its eight neighbours, the neighbours with
+    less weight: slopes leave no bias however unevenly the points lie. Gross errors are kept out by
+    a gate about medians. Cells without points are filled only where at least five direct neighbours have some.
+
+    Parameters
+    ----------
+    points : (N, 3) array, m
+        Easting, northing, height; NaN are left out. Points just outside the grid are not used.
+    grid : PixelGrid
+    kernel_cells : float
+        Standard deviation, in cells, of the Gaussian of the distance between cells that weighs the neighbours' points.
+    gate_sigmas : float
+        Points farther from the local surface than this many robust standard deviations are left out; half the relief of
+        the neighbouring cells is added, so that ridges stay.
+    point_sigma_m : float
+        Matching noise as standard deviation of the height of one point. The scatter within a cell is never
+        believed to be less, since neighbouring pixels err together.
+    points_per_independent : float
+        Number of neighbouring points that carry the information of one, for the same reason.
+
+    Notes
+    -----
+    Grids cut with a halo of `HALO_CELLS` cells give the heights of the whole.
+    """
+    rows, columns = grid.shape
+    ordered, starts = kernels.sort_by_cell(
+        np.ascontiguousarray(points, dtype=float), grid.x0, grid.y0, grid.step_x, grid.step_y, rows, columns
+    )
+    seeds = kernels.neighbourhood_medians(kernels.cell_medians(ordered, starts, rows, columns))
+    along_columns, along_rows = kernels.slopes_per_cell(seeds)
+    scatter = kernels.cell_scatter(ordered, starts, seeds, along_columns, along_rows, point_sigma_m)
+    moments = kernels.cell_moments(
+        ordered,
+        starts,
+        seeds,
+        along_columns,
+        along_rows,
+        kernels.neighbourhood_medians(scatter),
+        gate_sigmas,
+    )
+    height, deviation, effective = kernels.local_planes(
+        moments,
+        seeds,
+        along_columns,
+        along_rows,
+        math.exp(-1 / (2 * kernel_cells**2)),
+        _SLOPE_WEIGHT,
+        _NEIGHBOURS_TO_FILL,
+    )
+    count = moments[..., 0].astype(np.int32)
+    independent = np.maximum(effective / points_per_independent, 1.0)
+    sigma = np.maximum(deviation, np.float32(point_sigma_m)) / np.sqrt(independent)
+    return GriddedHeights(height, sigma.astype(np.float32), count)
+
+
+def map_boxes(frame: LocalFrame, crs: str, low_m: FloatArray, high_m: FloatArray) -> tuple[MapFrame, FloatArray]:
+    """Boxes on the map around boxes in the local frame, and the change between the two.
+
+    Parameters
+    ----------
+    frame : LocalFrame
+    crs : str
+    low_m, high_m : (N, 3) arrays, m
+        Least and greatest local coordinates of each box.
+
+    Returns
+    -------
+    map_frame : MapFrame
+        Valid in all boxes.
+    boxes : (N, 4) array, m
+        xmin, ymin, xmax, ymax.
+    """
+    ends = np.stack([low_m, high_m])
+    picks = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, -1).T
+    corners = np.stack([np.stack([ends[p, :, axis] for axis, p in enumerate(pick)], axis=-1) for pick in picks])
+    lonlath = frame.geodetic_from_local(corners)
+    placed = Transformer.from_crs("EPSG:4979", crs, always_xy=True).transform(*np.moveaxis(lonlath, -1, 0))[:2]
+    boxes = np.stack([*(p.min(axis=0) for p in placed), *(p.max(axis=0) for p in placed)], axis=-1)
+    everything = (*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0))
+    return MapFrame(frame, crs, everything), boxes
+
+
+def boxes_meeting(boxes: FloatArray, bounds: tuple[float, float, float, float]) -> list[int]:
+    """Numbers of the boxes (N, 4) that share ground with bounds (xmin, ymin, xmax, ymax)."""
+    xmin, ymin, xmax, ymax = bounds
+    meets = (boxes[:, 0] <= xmax) & (boxes[:, 2] >= xmin) & (boxes[:, 1] <= ymax) & (boxes[:, 3] >= ymin)
+    return [int(n) for n in np.flatnonzero(meets)]

@@ -1,0 +1,161 @@
+"""Orthophotos: film brought onto the map through heights, hidden ground left empty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
+from cosp.geometry.grids import PixelGrid
+from cosp.imaging.resampling import sample
+from cosp.imaging.windows import Window
+from cosp.surface import kernels
+
+_NODE_CELLS = 32  # the direction to the lens changes by a millionth per metre: linear between such nodes
+
+
+def direction_to_lens(
+    locate: Callable[[FloatArray, float], FloatArray],
+    grid: PixelGrid,
+    film_mm: Callable[[FloatArray, float], FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Map distance per metre of height towards the lens, at every cell of a grid.
+
+    Parameters
+    ----------
+    locate : function
+        Easting and northing (..., 2) of film points (..., 2) at an ellipsoidal height.
+    grid : PixelGrid
+    film_mm : function
+        Film points (..., 2) of eastings and northings (..., 2) at an ellipsoidal height.
+
+    Returns
+    -------
+    east, north : arrays of the grid's shape
+        Metres on the map per metre of height; NaN off the film.
+    """
+    rise_m = 1000.0
+    rows = np.arange(0, grid.shape[0] + _NODE_CELLS, _NODE_CELLS)
+    columns = np.arange(0, grid.shape[1] + _NODE_CELLS, _NODE_CELLS)
+    nodes = grid.points(rows[:, None], columns[None, :])
+    moved = (locate(film_mm(nodes, 0.0), rise_m) - nodes) / rise_m
+    at = np.meshgrid(
+        np.arange(grid.shape[0]) / _NODE_CELLS, np.arange(grid.shape[1]) / _NODE_CELLS, indexing="ij", sparse=True
+    )
+    east, north = (_bilinear(moved[..., i], at[0][:, 0], at[1][0]) for i in range(2))
+    return east, north
+
+
+def hidden_from_lens(
+    heights_m: FloatArray,
+    window: Window,
+    grid: PixelGrid,
+    east: FloatArray,
+    north: FloatArray,
+    *,
+    tolerance_m: float,
+) -> BoolArray:
+    """Cells of a window that the lens does not see because terrain stands before them.
+
+    Parameters
+    ----------
+    heights_m : (R, C) array
+        Of the whole grid, so that far ridges count; NaN hides nothing.
+    window : Window
+    grid : PixelGrid
+    east, north : arrays of the window's shape
+        From `direction_to_lens` of the window's grid.
+    tolerance_m : float
+        Terrain must rise this far above the line of sight; matching noise must not hide ground.
+
+    Returns
+    -------
+    boolean array of the window's shape
+    """
+    top = float(np.nanmax(heights_m)) if np.isfinite(heights_m).any() else 0.0
+    return kernels.hidden_cells(
+        np.asarray(heights_m, np.float32),
+        np.ascontiguousarray(east / grid.step_x),
+        np.ascontiguousarray(north / grid.step_y),
+        tolerance_m,
+        top,
+        window.row0,
+        window.row1,
+        window.column0,
+        window.column1,
+    )
+
+
+def sample_film(film: ByteArray, film_grid: PixelGrid, film_mm: FloatArray, hidden: BoolArray) -> ByteArray:
+    """Grey values of the film at film points, 0 where there is none or the ground is hidden.
+
+    Parameters
+    ----------
+    film : (R, C) uint8 array
+        0 means outside of the exposed area.
+    film_grid : PixelGrid
+        Of `film`, in millimetres.
+    film_mm : (..., 2) array
+    hidden : (...) boolean array
+    """
+    rows, columns = film_grid.pixels(film_mm)
+    grey = sample(film, rows, columns, interpolation="cubic", border=0)
+    # The kernel overshoots beside dark film and may reach 0, which stands for no data.
+    exposed = sample(film, rows, columns, interpolation="nearest", border=0) > 0
+    return np.where(exposed & ~hidden, np.maximum(grey, 1), 0).astype(np.uint8)
+
+
+def fill_heights(heights_m: FloatArray, reference_m: FloatArray) -> Float32Array:
+    """Heights with holes filled from another model, moved by the median difference of the two."""
+    difference = heights_m - reference_m
+    known = np.isfinite(difference)
+    shift = float(np.median(difference[known])) if known.any() else 0.0
+    return np.where(np.isfinite(heights_m), heights_m, reference_m + shift).astype(np.float32)
+
+
+def heights_on(heights_m: Float32Array, grid: PixelGrid, part: PixelGrid) -> tuple[Window, Float32Array]:
+    """Heights at the cells of another grid, and the window of the model's grid that it lies in.
+
+    Bilinear; the model's own heights where both grids agree.
+    """
+    xmin, ymin, xmax, ymax = part.bounds
+    rows, columns = grid.pixels(np.array([[xmin, ymax], [xmax, ymin]]))
+    below = Window(
+        int(np.floor(rows.min())) - 1,
+        int(np.ceil(rows.max())) + 2,
+        int(np.floor(columns.min())) - 1,
+        int(np.ceil(columns.max())) + 2,
+    ).grown(0, grid.shape)
+    at_rows, at_columns = grid.pixels(part.centres())
+    return below, sample(heights_m, at_rows, at_columns, interpolation="linear", border=np.nan)
+
+
+def nearest_on(values: BoolArray, grid: PixelGrid, part: PixelGrid) -> BoolArray:
+    """Marks of a grid at the cells of another one, the nearest each."""
+    rows, columns = grid.pixels(part.centres())
+    return np.asarray(sample(values.astype(np.uint8), rows, columns, interpolation="nearest") > 0)
+
+
+def film_window(film_grid: PixelGrid, film_mm: FloatArray, reach_px: int = 6) -> Window | None:
+    """The part of a film that holds the given film points and what a resampling kernel reaches; None if none does."""
+    rows, columns = film_grid.pixels(film_mm[np.isfinite(film_mm).all(-1)])
+    if not rows.size:
+        return None
+    bounds = Window(
+        int(np.floor(max(rows.min(), -1e6))) - reach_px,
+        int(np.ceil(min(rows.max(), 1e6))) + reach_px + 1,
+        int(np.floor(max(columns.min(), -1e6))) - reach_px,
+        int(np.ceil(min(columns.max(), 1e6))) + reach_px + 1,
+    ).grown(0, film_grid.shape)
+    return bounds if min(bounds.shape) > 0 else None
+
+
+def _bilinear(values: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+    """A lattice at fractional rows and columns, which form a grid themselves."""
+    r = np.minimum(rows.astype(int), values.shape[0] - 2)
+    c = np.minimum(columns.astype(int), values.shape[1] - 2)
+    p, q = (rows - r)[:, None], (columns - c)[None, :]
+    upper = values[np.ix_(r, c)] * (1 - q) + values[np.ix_(r, c + 1)] * q
+    lower = values[np.ix_(r + 1, c)] * (1 - q) + values[np.ix_(r + 1, c + 1)] * q
+    return np.asarray(upper * (1 - p) + lower * p)

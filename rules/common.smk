@@ -1,0 +1,160 @@
+"""Sheets read, wildcards constrained, and the few functions that rules share."""
+
+from snakemake.exceptions import WorkflowError
+
+from cosp import sheets
+from cosp import workflow as house
+
+try:
+    project = sheets.load(config, file=house.config_name(workflow.configfiles))
+except sheets.FaultySheets as faults:
+    raise WorkflowError(str(faults)) from None
+
+
+wildcard_constraints:
+    site=house.any_of(project.settings["sites"]),
+    scene=house.any_of(project.scenes),
+    pair=house.any_of(project.pairs),
+    block=house.any_of({scene.block for scene in project.scenes.values()}),
+    look="fore|aft",
+
+
+scattergather:
+    match_tiles=house.strip_count(project),
+    match_dense=house.strip_count(project),
+
+
+def choices(section):
+    """The section of a rule in the config, as its parameters."""
+    return project.settings[section]
+
+
+def scene_of(wildcards):
+    """Row of the scene sheet."""
+    return project.scenes[wildcards.scene]
+
+
+def of_scene(name):
+    """Function that gives one entry of a scene's row."""
+    return lambda wildcards: getattr(scene_of(wildcards), name)
+
+
+def of_site(key):
+    """Function that gives one entry of the site of a scene, pair or block."""
+    return lambda wildcards: project.settings["sites"][
+        house.site_of(project, wildcards)
+    ][key]
+
+
+def site_file(key):
+    """Function that gives a file of the site; none where the config names none."""
+    return lambda wildcards: house.site_file(
+        project, house.site_of(project, wildcards), key
+    )
+
+
+def member(look):
+    """Function that gives the scene of a pair by its look."""
+    return lambda wildcards: getattr(project.pairs[wildcards.pair], look)
+
+
+def film_of(look, name):
+    """Function that gives a file of the fore or aft scene of a pair."""
+    return lambda wildcards: f"results/scenes/{member(look)(wildcards)}/{name}"
+
+
+def cameras_of_pair(wildcards):
+    """Folder of the adjusted cameras of a pair's block."""
+    return f"results/blocks/{project.block_of(wildcards.pair)}/cameras"
+
+
+def block_file(name):
+    """Function that gives a file of a pair's block."""
+    return lambda wildcards: f"results/blocks/{project.block_of(wildcards.pair)}/{name}"
+
+
+def parts_of_scene(wildcards):
+    """Digitised parts of a scene that are there, or that the simulator will write."""
+    scene = scene_of(wildcards)
+    return house.part_paths(
+        scene, simulated=sheets.is_simulated(project.settings, scene.site, scene.parts)
+    )
+
+
+def missing_parts(wildcards):
+    """Digitised parts of a scene that are not there, for its job to say so."""
+    scene = scene_of(wildcards)
+    return house.missing_parts(
+        scene, simulated=sheets.is_simulated(project.settings, scene.site, scene.parts)
+    )
+
+
+def crs_of_site(wildcards):
+    """Coordinate system of the products."""
+    return house.site_crs(project, house.site_of(project, wildcards))
+
+
+def scenes_of_block(wildcards):
+    """Scenes of a block, in the order of the sheet."""
+    return project.scenes_of_block(wildcards.block)
+
+
+def pairs_of_block(wildcards):
+    """Pairs of a block, in the order of the sheet."""
+    return project.pairs_of_block(wildcards.block)
+
+
+def members_of_block_pairs(wildcards):
+    """Fore and aft scene of every pair of a block."""
+    return [
+        [project.pairs[pair].fore, project.pairs[pair].aft]
+        for pair in pairs_of_block(wildcards)
+    ]
+
+
+def of_block(pattern):
+    """Function that gives a file of every scene of a block."""
+    return lambda wildcards: expand(pattern, scene=scenes_of_block(wildcards))
+
+
+def of_pairs_of_block(pattern):
+    """Function that gives a file of every pair of a block."""
+    return lambda wildcards: expand(pattern, pair=pairs_of_block(wildcards))
+
+
+def of_pairs_of_site(pattern):
+    """Function that gives a file of every pair of a site."""
+    return lambda wildcards: expand(pattern, pair=project.pairs_of_site(wildcards.site))
+
+
+def of_scenes_of_site(pattern):
+    """Function that gives a file of every scene of a site that is in a pair."""
+    return lambda wildcards: expand(
+        pattern, scene=project.scenes_of_site(wildcards.site)
+    )
+
+
+def of_blocks_of_site(pattern):
+    """Function that gives a file of every block of a site."""
+    return lambda wildcards: expand(
+        pattern, block=project.blocks_of_site(wildcards.site)
+    )
+
+
+def settings_for_page(wildcards):
+    """What the quality page says was chosen."""
+    return house.settings_for_page(project, wildcards.site)
+
+
+def memory(bytes_per_px):
+    """Function that asks for memory by the size of the largest film that the job touches."""
+    return lambda wildcards: house.memory_mb(
+        house.largest_film_mpx(project, wildcards), bytes_per_px=bytes_per_px
+    )
+
+
+def runtime(us_per_px):
+    """Function that asks for minutes by the size of the largest film that the job touches."""
+    return lambda wildcards, threads: house.runtime_min(
+        house.largest_film_mpx(project, wildcards), us_per_px=us_per_px, threads=threads
+    )

@@ -1,0 +1,115 @@
+rule locate_coarsely:
+    input:
+        film="results/scenes/{scene}/film.tif",
+        camera="results/scenes/{scene}/camera_predicted.json",
+        reference_dem=of_site("reference_dem"),
+        reference_image=site_file("reference_image"),
+    output:
+        footprint="results/scenes/{scene}/footprint.json",
+    log:
+        "logs/locate_coarsely/{scene}.log",
+    benchmark:
+        "benchmarks/locate_coarsely/{scene}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(2),
+        runtime=30,
+    params:
+        **choices("locate_coarsely"),
+        library=house.script_digest("locate_coarsely"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+    message:
+        "Searching where {wildcards.scene} lies"
+    script:
+        "../scripts/locate_coarsely.py"
+
+
+rule match_tiles:
+    input:
+        film="results/scenes/{scene}/film.tif",
+        footprint="results/scenes/{scene}/footprint.json",
+        reference_dem=of_site("reference_dem"),
+        reference_image=site_file("reference_image"),
+    output:
+        matches=temp("results/scenes/{scene}/matches/{scatteritem}.parquet"),
+    log:
+        "logs/match_tiles/{scene}_{scatteritem}.log",
+    benchmark:
+        "benchmarks/match_tiles/{scene}_{scatteritem}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 1
+    resources:
+        mem_mb=memory(0.5),
+        runtime=runtime(2),
+    params:
+        **choices("match_tiles"),
+        library=house.script_digest("match_tiles"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+    message:
+        "Matching {wildcards.scene} with the reference, strip {wildcards.scatteritem}"
+    script:
+        "../scripts/match_tiles.py"
+
+
+rule collect_gcps:
+    input:
+        matches=gather.match_tiles(
+            "results/scenes/{{scene}}/matches/{scatteritem}.parquet"
+        ),
+        film="results/scenes/{scene}/film.tif",
+        footprint="results/scenes/{scene}/footprint.json",
+        reference_dem=of_site("reference_dem"),
+        unstable_terrain=site_file("unstable_terrain"),
+    output:
+        gcps="results/scenes/{scene}/gcps.parquet",
+        summary="results/scenes/{scene}/gcps.json",
+    log:
+        "logs/collect_gcps/{scene}.log",
+    benchmark:
+        "benchmarks/collect_gcps/{scene}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 1
+    resources:
+        mem_mb=3000,
+        runtime=15,
+    params:
+        **choices("collect_gcps"),
+        library=house.script_digest("collect_gcps"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+    message:
+        "Choosing ground control of {wildcards.scene}"
+    script:
+        "../scripts/collect_gcps.py"
+
+
+rule match_pair:
+    input:
+        fore_film=film_of("fore", "film.tif"),
+        aft_film=film_of("aft", "film.tif"),
+        fore_footprint=film_of("fore", "footprint.json"),
+        aft_footprint=film_of("aft", "footprint.json"),
+        reference_dem=of_site("reference_dem"),
+    output:
+        tie_points="results/pairs/{pair}/tie_points.parquet",
+    log:
+        "logs/match_pair/{pair}.log",
+    benchmark:
+        "benchmarks/match_pair/{pair}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(2),
+        runtime=runtime(3),
+    params:
+        **choices("match_pair"),
+        library=house.script_digest("match_pair"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+    message:
+        "Matching fore with aft of {wildcards.pair}"
+    script:
+        "../scripts/match_pair.py"

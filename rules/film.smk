@@ -1,0 +1,82 @@
+rule stitch:
+    input:
+        parts=parts_of_scene,
+    output:
+        stitched=temp("results/scenes/{scene}/stitched.tif"),
+        seams="results/scenes/{scene}/seams.json",
+    log:
+        "logs/stitch/{scene}.log",
+    benchmark:
+        "benchmarks/stitch/{scene}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(2),
+        runtime=runtime(0.2),
+    params:
+        **choices("stitch"),
+        library=house.script_digest("stitch"),
+        missing=missing_parts,
+        pixel_um=of_scene("pixel_um"),
+    message:
+        "Joining the parts of {wildcards.scene}"
+    script:
+        "../scripts/stitch.py"
+
+
+rule trace_stripes:
+    input:
+        stitched="results/scenes/{scene}/stitched.tif",
+    output:
+        exposure="results/scenes/{scene}/exposure.json",
+        stripes="results/scenes/{scene}/stripes.parquet",
+    log:
+        "logs/trace_stripes/{scene}.log",
+    benchmark:
+        "benchmarks/trace_stripes/{scene}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(1),
+        runtime=runtime(0.2),
+    params:
+        **choices("trace_stripes"),
+        library=house.script_digest("trace_stripes"),
+        camera=of_scene("camera"),
+        pixel_um=of_scene("pixel_um"),
+    message:
+        "Finding exposed area and stripes of {wildcards.scene}"
+    script:
+        "../scripts/trace_stripes.py"
+
+
+rule correct_bending:
+    input:
+        stitched="results/scenes/{scene}/stitched.tif",
+        seams="results/scenes/{scene}/seams.json",
+        exposure="results/scenes/{scene}/exposure.json",
+        stripes="results/scenes/{scene}/stripes.parquet",
+    output:
+        film="results/scenes/{scene}/film.tif",
+        summary="results/scenes/{scene}/film.json",
+    log:
+        "logs/correct_bending/{scene}.log",
+    benchmark:
+        "benchmarks/correct_bending/{scene}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(3),
+        runtime=runtime(0.3),
+    params:
+        **choices("correct_bending"),
+        library=house.script_digest("correct_bending"),
+        look=of_scene("look"),
+        camera=of_scene("camera"),
+    message:
+        "Straightening {wildcards.scene}"
+    script:
+        "../scripts/correct_bending.py"

@@ -1,0 +1,138 @@
+rule match_dense:
+    input:
+        fore="results/pairs/{pair}/fore_epipolar.tif",
+        aft="results/pairs/{pair}/aft_epipolar.tif",
+        y_parallax="results/pairs/{pair}/y_parallax.tif",
+        rectification="results/pairs/{pair}/rectification.json",
+    output:
+        disparity=temp("results/pairs/{pair}/disparity/{scatteritem}.tif"),
+    log:
+        "logs/match_dense/{pair}_{scatteritem}.log",
+    benchmark:
+        "benchmarks/match_dense/{pair}_{scatteritem}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(4),
+        runtime=runtime(1),
+    params:
+        **choices("match_dense"),
+        scatteritem=lambda wildcards: wildcards.scatteritem,
+        library=house.script_digest("match_dense"),
+    message:
+        "Dense matching of {wildcards.pair}, strip {wildcards.scatteritem}"
+    script:
+        "../scripts/match_dense.py"
+
+
+rule merge_disparity:
+    input:
+        strips=gather.match_dense("results/pairs/{{pair}}/disparity/{scatteritem}.tif"),
+    output:
+        disparity="results/pairs/{pair}/disparity.tif",
+        validity="results/pairs/{pair}/validity.tif",
+        summary="results/pairs/{pair}/disparity.json",
+    log:
+        "logs/merge_disparity/{pair}.log",
+    benchmark:
+        "benchmarks/merge_disparity/{pair}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 1
+    resources:
+        mem_mb=memory(1),
+        runtime=runtime(0.1),
+    params:
+        library=house.script_digest("merge_disparity"),
+    message:
+        "Joining the disparity of {wildcards.pair}"
+    script:
+        "../scripts/merge_disparity.py"
+
+
+rule triangulate:
+    input:
+        disparity="results/pairs/{pair}/disparity.tif",
+        y_parallax="results/pairs/{pair}/y_parallax.tif",
+        rectification="results/pairs/{pair}/rectification.json",
+        cameras=cameras_of_pair,
+    output:
+        points=temp("results/pairs/{pair}/points.tif"),
+        summary="results/pairs/{pair}/points.json",
+    log:
+        "logs/triangulate/{pair}.log",
+    benchmark:
+        "benchmarks/triangulate/{pair}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(1),
+        runtime=runtime(0.3),
+    params:
+        **choices("triangulate"),
+        library=house.script_digest("triangulate"),
+        fore=member("fore"),
+        aft=member("aft"),
+    message:
+        "Intersecting conjugate rays of {wildcards.pair}"
+    script:
+        "../scripts/triangulate.py"
+
+
+rule grid_dem:
+    input:
+        points="results/pairs/{pair}/points.tif",
+        summary="results/pairs/{pair}/points.json",
+    output:
+        dem="results/pairs/{pair}/dem.tif",
+        sigma="results/pairs/{pair}/dem_sigma.tif",
+    log:
+        "logs/grid_dem/{pair}.log",
+    benchmark:
+        "benchmarks/grid_dem/{pair}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(4),
+        runtime=runtime(0.3),
+    params:
+        **choices("grid_dem"),
+        library=house.script_digest("grid_dem"),
+        crs=crs_of_site,
+        resolution_m=of_site("dem_resolution_m"),
+    message:
+        "Gridding the heights of {wildcards.pair}"
+    script:
+        "../scripts/grid_dem.py"
+
+
+rule orthorectify:
+    input:
+        film=film_of("fore", "film.tif"),
+        cameras=cameras_of_pair,
+        reference_dem=of_site("reference_dem"),
+        dem="results/pairs/{pair}/dem.tif",
+    output:
+        ortho="results/pairs/{pair}/ortho.tif",
+    log:
+        "logs/orthorectify/{pair}.log",
+    benchmark:
+        "benchmarks/orthorectify/{pair}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(2),
+        runtime=runtime(0.3),
+    params:
+        **choices("orthorectify"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+        library=house.script_digest("orthorectify"),
+        fore=member("fore"),
+    message:
+        "Orthorectifying the fore film of {wildcards.pair}"
+    script:
+        "../scripts/orthorectify.py"

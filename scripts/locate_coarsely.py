@@ -1,0 +1,74 @@
+"""Find where a film lies on the ground: predicted camera in, camera fitted to the reference out."""
+
+import numpy as np
+
+from cosp.camera.panoramic import PanoramicCamera
+from cosp.io import rasters, records, references
+from cosp.io.logs import log_to
+from cosp.matching.film_image import FilmImage
+from cosp.matching.ground import map_crs
+from cosp.matching.search import locate_film
+
+
+def locate_coarsely(
+    film_path,
+    camera_path,
+    reference_dem_path,
+    reference_image_path,
+    footprint_path,
+    *,
+    reference_dem_heights,
+    search_km,
+    coarse_posting_m,
+    fine_posting_m,
+    min_score,
+    min_margin,
+    min_agreeing,
+    min_agreeing_share,
+    min_block_share,
+    seed,
+    threads,
+):
+    camera = records.read(camera_path, PanoramicCamera)
+    crs = map_crs(camera)
+    film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
+    footprint = locate_film(
+        film,
+        camera,
+        reference_on=references.image_on(reference_image_path, crs) if reference_image_path else None,
+        heights_on=references.heights_on(reference_dem_path, crs, reference_dem_heights),
+        crs=crs,
+        search_m=1000.0 * search_km,
+        coarse_posting_m=coarse_posting_m,
+        fine_posting_m=fine_posting_m,
+        min_score=min_score,
+        min_margin=min_margin,
+        min_agreeing=min_agreeing,
+        min_agreeing_share=min_agreeing_share,
+        min_block_share=min_block_share,
+        rng=np.random.default_rng(seed),
+        threads=threads,
+    )
+    records.write(footprint_path, footprint)
+
+
+if __name__ == "__main__":
+    with log_to(snakemake.log[0]):
+        locate_coarsely(
+            film_path=snakemake.input.film,
+            camera_path=snakemake.input.camera,
+            reference_dem_path=snakemake.input.reference_dem,
+            reference_image_path=snakemake.input.get("reference_image"),
+            footprint_path=snakemake.output.footprint,
+            reference_dem_heights=snakemake.params.reference_dem_heights,
+            search_km=snakemake.params.search_km,
+            coarse_posting_m=snakemake.params.coarse_posting_m,
+            fine_posting_m=snakemake.params.fine_posting_m,
+            min_score=snakemake.params.min_score,
+            min_margin=snakemake.params.min_margin,
+            min_agreeing=snakemake.params.min_agreeing,
+            min_agreeing_share=snakemake.params.min_agreeing_share,
+            min_block_share=snakemake.params.min_block_share,
+            seed=snakemake.params.seed,
+            threads=snakemake.threads,
+        )

@@ -1,0 +1,97 @@
+"""Match one strip of a placed film against the reference, tile by tile on the map."""
+
+import pandas as pd
+
+from cosp.imaging.windows import strip_of
+from cosp.io import rasters, records, references, tables
+from cosp.io.logs import log_to
+from cosp.matching.film_image import FilmImage
+from cosp.matching.footprint import Footprint
+from cosp.matching.ground import control_tiles, map_crs, match_strip
+from cosp.matching.matchers import matcher_by_name
+from cosp.matching.relief import relief_reference
+
+
+def match_tiles(
+    film_path,
+    footprint_path,
+    reference_dem_path,
+    reference_image_path,
+    matches_path,
+    *,
+    scatteritem,
+    reference_dem_heights,
+    matcher,
+    template_px,
+    search_px,
+    min_score,
+    max_ratio,
+    max_return_px,
+    candidates,
+    threads,
+):
+    footprint = records.read(footprint_path, Footprint)
+    camera = footprint.camera
+    crs = map_crs(camera)
+    heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
+    if reference_image_path:
+        reference_on = references.image_on(reference_image_path, crs)
+        reference_posting_m = references.posting_m(reference_image_path)
+    else:
+        reference_on = relief_reference(heights_on, footprint.sun_azimuth_deg)
+        reference_posting_m = references.posting_m(reference_dem_path)
+    film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
+    tiles_mm = control_tiles(camera, candidates)
+    first, last = strip_of(len(tiles_mm), scatteritem)
+    matches, posting_m, pixel_m = match_strip(
+        film,
+        camera,
+        tiles_mm[first:last],
+        reference_on=reference_on,
+        heights_on=heights_on,
+        crs=crs,
+        matcher=matcher_by_name(
+            matcher,
+            template_px=template_px,
+            search_px=search_px,
+            min_score=min_score,
+            max_ratio=max_ratio,
+            max_return_px=max_return_px,
+        ),
+        reference_posting_m=reference_posting_m,
+        template_px=template_px,
+        search_px=search_px,
+        threads=threads,
+    )
+    lonlath = matches.lonlath(crs)
+    table = {
+        "x_mm": matches.film_mm[:, 0],
+        "y_mm": matches.film_mm[:, 1],
+        "longitude_deg": lonlath[:, 0],
+        "latitude_deg": lonlath[:, 1],
+        "score": matches.score,
+        "sigma_px": matches.sigma_m / pixel_m,
+        "posting_m": posting_m,
+    }
+    tables.write(matches_path, pd.DataFrame(table))
+
+
+if __name__ == "__main__":
+    with log_to(snakemake.log[0]):
+        match_tiles(
+            film_path=snakemake.input.film,
+            footprint_path=snakemake.input.footprint,
+            reference_dem_path=snakemake.input.reference_dem,
+            reference_image_path=snakemake.input.get("reference_image"),
+            matches_path=snakemake.output.matches,
+            scatteritem=snakemake.wildcards.scatteritem,
+            reference_dem_heights=snakemake.params.reference_dem_heights,
+            matcher=snakemake.params.matcher,
+            template_px=snakemake.params.template_px,
+            search_px=snakemake.params.search_px,
+            min_score=snakemake.params.min_score,
+            max_ratio=snakemake.params.max_ratio,
+            max_return_px=snakemake.params.max_return_px,
+            candidates=snakemake.params.candidates,
+            threads=snakemake.threads,
+        )

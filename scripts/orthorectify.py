@@ -1,0 +1,96 @@
+"""Bring the fore film onto the map: film, camera and heights in, orthophoto out."""
+
+import logging
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from cosp.camera.mapping import MapProjector
+from cosp.camera.panoramic import PanoramicCamera
+from cosp.geometry.grids import PixelGrid
+from cosp.imaging.windows import tiles
+from cosp.io import rasters, records
+from cosp.io.heights import ellipsoidal_heights
+from cosp.io.logs import log_to
+from cosp.surface.orthophoto import (
+    direction_to_lens,
+    fill_heights,
+    film_window,
+    heights_on,
+    hidden_from_lens,
+    nearest_on,
+    sample_film,
+)
+
+
+def orthorectify(
+    film_path,
+    camera_path,
+    dem_path,
+    reference_dem_path,
+    ortho_path,
+    *,
+    reference_dem_heights,
+    resolution_m,
+    tolerance_m,
+    threads,
+):
+    log = logging.getLogger("orthorectify")
+    camera = records.read(camera_path, PanoramicCamera)
+    film_grid = rasters.info(film_path).grid
+    dem = rasters.info(dem_path)
+    grid, crs = dem.grid, dem.crs
+    reference = ellipsoidal_heights(reference_dem_path, grid, crs, reference_dem_heights)
+    heights_m = fill_heights(rasters.read(dem_path), reference)
+    projector = MapProjector(camera, crs, grid.bounds)
+
+    def film_of(xy, height):
+        return projector.film(xy[..., 0], xy[..., 1], height)
+
+    def locate(film_mm, height):
+        return projector.map_frame.map_from_local(camera.locate(film_mm, height))[..., :2]
+
+    ortho_grid = grid if resolution_m is None else PixelGrid.covering(grid.bounds, resolution_m)
+
+    def expose(tile):
+        part = ortho_grid.window(tile.row0, tile.row1, tile.column0, tile.column1)
+        below, height = heights_on(heights_m, grid, part)
+        film_mm = film_of(part.centres(), height)
+        window = film_window(film_grid, film_mm)
+        if window is None:
+            return np.zeros(tile.shape, np.uint8)
+        ground = grid.window(below.row0, below.row1, below.column0, below.column1)
+        hidden = hidden_from_lens(
+            heights_m, below, grid, *direction_to_lens(locate, ground, film_of), tolerance_m=tolerance_m
+        )
+        film = rasters.read(film_path, window=window)
+        film_part = film_grid.window(window.row0, window.row1, window.column0, window.column1)
+        return sample_film(film, film_part, film_mm, nearest_on(hidden, ground, part))
+
+    every = tiles(ortho_grid.shape, 512)
+    with (
+        rasters.create(
+            ortho_path, shape=ortho_grid.shape, dtype="uint8", grid=ortho_grid, crs=crs, nodata=0, cog=True
+        ) as ortho,
+        ThreadPoolExecutor(threads) as pool,
+    ):
+        for start in range(0, len(every), threads):
+            batch = every[start : start + threads]
+            for tile, grey in zip(batch, pool.map(expose, batch), strict=True):
+                ortho.write(tile, grey)
+            log.info("exposed %d/%d tiles", min(start + threads, len(every)), len(every))
+
+
+if __name__ == "__main__":
+    with log_to(snakemake.log[0]):
+        orthorectify(
+            film_path=snakemake.input.film,
+            camera_path=f"{snakemake.input.cameras}/{snakemake.params.fore}.json",
+            dem_path=snakemake.input.dem,
+            reference_dem_path=snakemake.input.reference_dem,
+            ortho_path=snakemake.output.ortho,
+            reference_dem_heights=snakemake.params.reference_dem_heights,
+            resolution_m=snakemake.params.resolution_m,
+            tolerance_m=snakemake.params.tolerance_m,
+            threads=snakemake.threads,
+        )

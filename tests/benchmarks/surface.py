@@ -1,0 +1,104 @@
+"""Speed of intersection and gridding beside plain numpy and scipy, in processor time of one core.
+
+python tests/benchmarks/surface.py [points]
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+from scipy.stats import binned_statistic_2d
+
+from cosp.geometry.grids import PixelGrid
+from cosp.geometry.rays import meet
+from cosp.surface.gridding import grid_points
+from cosp.surface.intersection import intersect_tabulated, tabulate_rays
+from tests.surface.synthetic import camera
+
+ROUNDS = 5
+
+
+def normal_equations(first, second):
+    """Ground points of two sets of rays by numpy's batched solver."""
+    matrix, right = 0.0, 0.0
+    for rays in (first, second):
+        across = np.eye(3) - rays.direction[:, :, None] * rays.direction[:, None, :]
+        matrix = matrix + across
+        right = right + (across @ rays.origin[:, :, None])[:, :, 0]
+    return np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+
+
+def interleaved(functions):
+    """Median of the processor seconds of each function, called in turns."""
+    spent = {name: [] for name in functions}
+    for _ in range(ROUNDS + 1):
+        for name, function in functions.items():
+            start = time.process_time()
+            function()
+            spent[name].append(time.process_time() - start)
+    return {name: float(np.median(times[1:])) for name, times in spent.items()}
+
+
+def intersection(count, rng):
+    fore, aft = camera("fore"), camera("aft")
+    ground = np.stack(
+        [rng.uniform(-9e4, 9e4, count), rng.uniform(-6e3, 6e3, count), rng.uniform(0, 6e3, count)], axis=-1
+    )
+    # Picture order: x changes slowly along a line of the rectified pair.
+    ground = ground[np.lexsort((ground[:, 1], ground[:, 0] // 40))]
+    films = [c.project(ground) for c in (fore, aft)]
+    tables = [tabulate_rays(c.rays, half_length_mm=372.0, half_width_mm=30.0, places=8192) for c in (fore, aft)]
+    few = count // 20
+    part = [film[:few] for film in films]
+    times = interleaved(
+        {
+            "tables, compiled": lambda: intersect_tabulated(*tables, *films),
+            "numpy, closed form": lambda: meet(fore.rays(part[0]), aft.rays(part[1])),
+            "numpy, batched solve": lambda: normal_equations(fore.rays(part[0]), aft.rays(part[1])),
+        }
+    )
+    for name, seconds in times.items():
+        done = count if name.startswith("tables") else few
+        print(f"intersection  {name:24s} {done / seconds / 1e6:8.2f} Mpoints/s")
+    worst = np.abs(intersect_tabulated(*tables, *films)[0] - ground).max()
+    print(f"intersection  largest error of the tables {worst * 1000:.3f} mm")
+
+
+def gridding(count, rng):
+    side = int(count**0.5)
+    i, j = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    height = 1500 + 800 * np.sin(i / 300) * np.cos(j / 410) + 60 * np.sin(i / 31 + j / 43)
+    east = 2.2 * j + 0.1 * height + rng.normal(0, 0.3, height.shape)
+    north = -2.2 * i + 0.02 * height + rng.normal(0, 0.3, height.shape)
+    points = np.stack([east, north, height + rng.normal(0, 2, height.shape)], axis=-1).reshape(-1, 3)
+    bounds = (points[:, 0].min(), points[:, 1].min(), points[:, 0].max(), points[:, 1].max())
+    for posting in (5.0, 10.0, 30.0):
+        grid = PixelGrid.covering(bounds, posting)
+        xmin, ymin, xmax, ymax = grid.bounds
+        few = len(points) // 10
+        bins = {
+            "bins": [grid.shape[0] // 10 + 1, grid.shape[1]],
+            "range": [[ymax - (ymax - ymin) / 10, ymax], [xmin, xmax]],
+        }
+        times = interleaved(
+            {
+                "robust planes, compiled": lambda grid=grid: grid_points(
+                    points, grid, kernel_cells=0.5, gate_sigmas=5.0, point_sigma_m=1.5, points_per_independent=9.0
+                ),
+                "scipy mean of the cell": lambda bins=bins, few=few: binned_statistic_2d(
+                    points[:few, 1], points[:few, 0], points[:few, 2], "mean", **bins
+                ),
+            }
+        )
+        for name, seconds in times.items():
+            done = len(points) if name.startswith("robust") else few
+            print(f"gridding {posting:3.0f} m  {name:24s} {done / seconds / 1e6:8.2f} Mpoints/s")
+
+
+if __name__ == "__main__":
+    asked = int(sys.argv[1]) if len(sys.argv) > 1 else 2_000_000
+    generator = np.random.default_rng(0)
+    intersection(asked, generator)
+    gridding(asked, generator)

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from cosp.dense import kernels
+from cosp.dense.aggregation import aggregate_costs
+from cosp.dense.census import left_census, right_census
+
+
+@pytest.fixture
+def pictures():
+    """Noise with a hole, and the same moved by three columns, wide enough for 64 disparities."""
+    rng = np.random.default_rng(2)
+    left = rng.integers(1, 256, (30, 75), dtype=np.uint8)
+    left[10:14, 30:45] = 0
+    right = rng.integers(1, 256, (30, 75 + 80), dtype=np.uint8)
+    right[:, 43:118] = left
+    return left, right
+
+
+def passes_of(function, left, right, disparities):
+    rows, columns = left.shape
+    winners = np.empty((rows, columns), np.uint8)
+    costs = np.empty((rows, columns, 4), np.uint16)
+    right_winners = np.empty((rows, columns + disparities), np.uint8)
+    volume = np.empty((rows, columns, disparities), np.uint16)
+    function(left_census(left), right_census(right), 8, 24, 64, volume, winners, costs, right_winners)
+    return volume, winners, costs, right_winners
+
+
+def test_the_vector_census_is_the_plain_one_bit_for_bit(pictures):
+    for picture in pictures:
+        vector, plain = (np.full((kernels.PLANES, *picture.shape), 9, np.uint8) for _ in range(2))
+        kernels.census_vector(picture, vector, kernels.LEFT_BLANK)
+        kernels.census_plain(picture, plain, kernels.LEFT_BLANK)
+        assert_array_equal(vector, plain)
+
+
+@pytest.mark.parametrize("disparities", [32, 64])
+def test_the_vector_passes_are_the_plain_ones_bit_for_bit(pictures, disparities):
+    vector = passes_of(kernels.vector_passes(disparities), *pictures, disparities)
+    plain = passes_of(kernels.plain_passes, *pictures, disparities)
+    for ours, reference in zip(vector[1:], plain[1:], strict=True):
+        assert_array_equal(ours, reference)
+
+
+def test_the_census_sets_a_bit_for_every_darker_neighbour():
+    rng = np.random.default_rng(3)
+    picture = rng.integers(1, 256, (9, 44), dtype=np.uint8)
+    window = picture[1:8, 6:15].ravel()
+    darker = np.delete(window < window[31], 31)
+    assert_array_equal(left_census(picture)[:, 4, 10], np.packbits(darker, bitorder="little"))
+
+
+def test_paths_are_those_of_a_direct_computation_of_the_recursion(pictures):
+    left, right = (picture[:9, :44] for picture in pictures)
+    right = np.ascontiguousarray(np.pad(left, ((0, 0), (24, 24)), mode="reflect"))
+    left = np.ascontiguousarray(left)
+    disparities, small, large = 32, 5, 40
+    a, b = left_census(left), right_census(right)
+    rows, columns = left.shape
+    cost = np.zeros((rows, columns, disparities), int)
+    for d in range(disparities):
+        cost[..., d] = np.bitwise_count(a ^ b[:, :, 8 + d : 8 + d + columns]).sum(axis=0)
+    total = np.zeros_like(cost)
+    for down, across in [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]:
+        path = np.zeros_like(cost)
+        for row in range(rows)[:: down or 1]:
+            for column in range(columns)[:: across or 1]:
+                i, j = row - down, column - across
+                before = path[i, j] if 0 <= i < rows and 0 <= j < columns else np.zeros(disparities, int)
+                before = before - before.min()
+                beside = np.pad(before, 1, constant_values=999)
+                reached = np.minimum(before, np.minimum(beside[:-2], beside[2:]) + small)
+                path[row, column] = cost[row, column] + np.minimum(reached, large)
+        total += path
+    found = aggregate_costs(a, b, disparities=disparities, small_step=small, large_step=large)
+    assert_array_equal(found.winners, total.argmin(axis=2))
+    assert_array_equal(found.costs[..., kernels.BEST], total.min(axis=2))
+    apart = np.abs(np.arange(disparities) - found.winners[..., None]) > 1
+    assert_array_equal(found.costs[..., kernels.RUNNER_UP], np.where(apart, total, 9999).min(axis=2))
+
+
+def test_penalties_that_would_overflow_a_byte_are_refused(pictures):
+    left, right = pictures
+    with pytest.raises(ValueError, match="0 < small <= large <= 65"):
+        aggregate_costs(left_census(left), right_census(right), disparities=32, small_step=24, large_step=66)

@@ -1,0 +1,74 @@
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from cosp.dense.coarse_to_fine import match
+from cosp.geometry.grids import PixelGrid
+from cosp.io import rasters, records
+from tests.dense.synthetic import render, texture
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+
+def function_of(name):
+    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return getattr(module, name)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An epipolar pair of 700 rows, its y-parallax of two px at the top and none at the bottom, its rectification."""
+    folder = tmp_path_factory.mktemp("pair")
+    rng = np.random.default_rng(9)
+    rows, columns = np.mgrid[:700, :140]
+    y_parallax = 2 - 2 * rows / 699
+    pair = render(texture(rows.shape, rng), 6 + 0.03 * columns + 0.01 * rows, y_parallax=y_parallax, rng=rng)
+    grid = PixelGrid(0, 0, 1, 1, rows.shape)
+    rasters.write(folder / "fore.tif", pair.left, grid=grid, crs=rasters.PIXEL_CRS, nodata=0)
+    rasters.write(folder / "aft.tif", pair.right, grid=grid, crs=rasters.PIXEL_CRS, nodata=0)
+    coarse = np.full((2, 8, 3), np.nan, np.float32)
+    coarse[1] = 2 - 2 * (100 * np.arange(8)[:, None]) / 699
+    coarse[1, 7, 2] = np.nan
+    rasters.write(folder / "y.tif", coarse, grid=PixelGrid(0, 0, 70, 100, (8, 3)), crs=rasters.PIXEL_CRS)
+    records.write(folder / "rectification.json", {"disparity_range_px": [0.0, 24.0]})
+    return folder, pair
+
+
+def test_strips_join_to_what_the_whole_gives(folder, settings):
+    folder, pair = folder
+    strips = []
+    for strip in ("1-of-2", "2-of-2"):
+        strips.append(folder / f"{strip}.tif")
+        function_of("match_dense")(
+            folder / "fore.tif",
+            folder / "aft.tif",
+            folder / "y.tif",
+            folder / "rectification.json",
+            strips[-1],
+            strip=strip,
+            **settings,
+        )
+    function_of("merge_disparity")(
+        strips[::-1], folder / "disparity.tif", folder / "validity.tif", folder / "disparity.json"
+    )
+    disparity = rasters.read(folder / "disparity.tif")
+    validity, confidence = rasters.read(folder / "validity.tif", band=None)
+    assert disparity.shape == pair.left.shape
+    assert_array_equal(np.isnan(disparity), validity != 0)
+    assert confidence.dtype == np.uint8
+    inner = pair.seen.copy()
+    inner[:, :20] = inner[:, -30:] = False
+    error = (disparity - pair.disparity)[inner & (validity == 0)]
+    assert (validity[inner] == 0).mean() > 0.98
+    assert (np.abs(error) > 1).mean() < 0.01
+    # Two px of y-parallax at the top would have ruined this half.
+    assert (validity[:300][inner[:300]] == 0).mean() > 0.98
+    assert not (match(pair.left, pair.right, (0, 24), **settings).validity[:100][inner[:100]] == 0).mean() > 0.98
+    summary = records.read_json(folder / "disparity.json")
+    assert_allclose(summary["density"], (validity == 0).sum() / ((validity & 3) == 0).sum())
+    assert_allclose(summary["disparity_px"]["median"], np.nanmedian(disparity), atol=0.3)

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from scipy import ndimage
+
+from cosp.dense.validity import TEXTURE_WINDOW_PX, Validity, picture_validity, speckles, summarise_disparity
+
+
+def test_texture_and_saturation_are_those_of_the_window_around():
+    rng = np.random.default_rng(4)
+    spread = np.linspace(0, 6, 120)
+    picture = 120 + spread * rng.standard_normal((80, 120))
+    picture[30:60, 70:110] += 133
+    picture = np.clip(np.rint(picture), 1, 255).astype(np.uint8)
+    bits = picture_validity(picture, Validity.NO_DATA_LEFT, least_texture_sd=2.0, saturated_from=250)
+    windows = np.lib.stride_tricks.sliding_window_view(picture, (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX))
+    inner = bits[4:-4, 4:-4]
+    assert_array_equal((inner & Validity.LOW_TEXTURE) != 0, windows.std(axis=(2, 3)) < 2.0)
+    assert_array_equal((inner & Validity.SATURATED) != 0, (windows >= 250).mean(axis=(2, 3)) > 0.5)
+    corner = picture[:5, :5]  # windows are cut at the edges
+    assert bool(bits[0, 0] & Validity.LOW_TEXTURE) == (corner.std() < 2.0)
+
+
+def test_zero_is_no_data():
+    picture = np.full((20, 20), 50, np.uint8)
+    picture[3:6, 4:9] = 0
+    bits = picture_validity(picture, Validity.NO_DATA_RIGHT, least_texture_sd=0.0, saturated_from=255)
+    assert_array_equal(bits == Validity.NO_DATA_RIGHT, picture == 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_speckles_are_the_small_connected_islands(seed):
+    rng = np.random.default_rng(seed)
+    height = rng.integers(0, 3, (60, 90))
+    disparity = (10.0 * height).astype(np.float32)  # islands of equal height, whatever their outline
+    disparity[rng.random(disparity.shape) < 0.1] = np.nan
+    expected = np.zeros(disparity.shape, bool)
+    for value in range(3):
+        labels, _ = ndimage.label(disparity == 10 * value)
+        sizes = np.bincount(labels.ravel())
+        expected |= (labels > 0) & (sizes[labels] <= 12)
+    found = speckles(disparity, largest_speckle_px=12, speckle_step_px=1.5)
+    assert_array_equal(found, expected)
+    assert 0.1 < found.mean() < 0.9
+
+
+def test_a_slope_is_one_island_however_high_it_climbs():
+    climb = np.arange(100, dtype=np.float32)[None] * np.ones((3, 1), np.float32)
+    assert not speckles(climb, largest_speckle_px=299, speckle_step_px=1.0).any()
+    assert speckles(climb, largest_speckle_px=3, speckle_step_px=0.9).all()
+
+
+def test_the_summary_counts_bits_and_what_both_pictures_see():
+    counts = np.zeros(256, np.int64)
+    counts[0], counts[Validity.NO_DATA_RIGHT], counts[Validity.INCONSISTENT | Validity.SATURATED] = 60, 20, 20
+    summary = summarise_disparity(counts, np.array([1.0, 2.0, 3.0, np.nan]))
+    assert summary["density"] == 60 / 80
+    assert summary["share_by_bit"]["no_data_right"] == 0.2
+    assert summary["share_by_bit"]["saturated"] == 0.2
+    assert summary["disparity_px"]["median"] == 2

@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from cosp.film.bending import (
+    Bending,
+    bending_from_traces,
+    choose_bending,
+    film_grid,
+    joined_pixels,
+    joined_window,
+    no_bending,
+    straighten,
+)
+from cosp.film.exposure import Exposure
+from cosp.film.rail_holes import find_rail_holes
+from cosp.film.stripes import Trace, band_profiles, band_window, smooth_base, trace_edge, trace_ridge
+from cosp.imaging.windows import Window, tiles
+from tests.film.synthetic import LENGTH_MM, STRIPE_MM, WIDTH_MM, Film, bend_mm, make_film
+
+X_MM = np.arange(-371.5, 372.0)
+CHOICE = {
+    "min_share": 0.3,
+    "max_noise_mm": 0.05,
+    "step_mm": 5.0,
+    "smoothing_mm": 60.0,
+    "edge_smoothing_mm": 150.0,
+    "single_sd_mm": 0.05,
+    "none_sd_mm": 0.1,
+}
+
+
+@pytest.fixture(scope="module")
+def film() -> Film:
+    return make_film(np.random.default_rng(8), pixel_mm=0.112)
+
+
+def _exposure(film: Film) -> Exposure:
+    return Exposure(
+        pixel_mm=film.pixel_mm,
+        centre_px=film.centre,
+        tilt_deg=float(np.degrees(film.tilt_rad)),
+        half_length_mm=LENGTH_MM / 2,
+        half_width_mm=WIDTH_MM / 2,
+        centre_sd_mm=(0.01, 0.01),
+        ends_found=(True, True),
+        edges_found=(1.0, 1.0),
+    )
+
+
+def _band(film: Film, side: str, reach: tuple[float, float], image=None):
+    sign = 1 if side == "top" else -1
+    low, high = sorted(sign * r for r in reach)
+    y = np.arange(high, low, -film.pixel_mm)
+    base = np.full(len(X_MM), sign * WIDTH_MM / 2)
+    exposure = _exposure(film)
+    window = band_window(exposure, (low + base[0], high + base[0]), film.image.shape)
+    pixels = (film.image if image is None else image)[window.slices]
+    return band_profiles(pixels, window, exposure, x_mm=X_MM, y_mm=y, base_mm=base, samples=16), y, base
+
+
+def _stripe(film: Film, side: str, image=None) -> Trace:
+    band, y, base = _band(film, side, (0.3, 6.5), image)
+    trace = trace_ridge(band, y, X_MM, side=side, slope_mm=0.02, min_contrast=4.0, outlier_mm=0.05)
+    return trace.raised(base)
+
+
+def _edge(film: Film, side: str) -> Trace:
+    band, y, base = _band(film, side, (-1.5, 1.5))
+    return trace_edge(band, y, X_MM, side=side, min_step=10.0, outlier_mm=0.05).raised(base)
+
+
+@pytest.mark.parametrize(("side", "sign"), [("top", 1), ("bottom", -1)])
+def test_a_stripe_is_traced_to_a_tenth_of_a_pixel(film, side, sign):
+    trace = _stripe(film, side)
+    truth = sign * (WIDTH_MM / 2 + STRIPE_MM) + bend_mm(X_MM, sign)
+    assert trace.share > 0.97
+    assert np.sqrt(np.nanmean((trace.y_mm - truth) ** 2)) < 0.1 * film.pixel_mm
+    assert 0.0 < trace.noise_mm < 0.1 * film.pixel_mm
+
+
+def test_the_base_follows_the_edge_of_the_picture_and_is_straight_without_one(film):
+    edge = _edge(film, "top")
+    base = smooth_base(edge, straight_mm=27.7, min_share=0.3)
+    share = (WIDTH_MM + STRIPE_MM) / (WIDTH_MM + 2 * STRIPE_MM)  # of the way from the bottom stripe to the top one
+    truth = WIDTH_MM / 2 + bend_mm(X_MM, -1) + share * (bend_mm(X_MM, 1) - bend_mm(X_MM, -1))
+    assert_allclose(base, truth, atol=0.03)
+    assert_array_equal(smooth_base(edge, straight_mm=27.7, min_share=1.1), np.full(len(X_MM), 27.7))
+
+
+def test_gaps_in_a_stripe_are_bridged(film):
+    image = film.image.copy()
+    rng = np.random.default_rng(3)
+    strip = slice(0, round(film.centre[1] - (WIDTH_MM / 2 + 0.5) / film.pixel_mm))
+    # Six tenths of the stripe are gone, in pieces of 20 mm.
+    for start in rng.choice(np.arange(0, 720, 20), 22, replace=False):
+        c0 = round(film.centre[0] + (start - 370) / film.pixel_mm)
+        part = image[strip, c0 : c0 + round(20 / film.pixel_mm)]
+        image[strip, c0 : c0 + round(20 / film.pixel_mm)] = rng.normal(22, 2, part.shape).astype(np.uint8)
+    top, bottom = _stripe(film, "top", image), _stripe(film, "bottom", image)
+    assert 0.3 < top.share < 0.55
+    bending = bending_from_traces(top, bottom, source="stripes", step_mm=5.0, smoothing_mm=60.0, single_sd_mm=0.05)
+    assert _straightness_px(bending, film) < 0.3
+
+
+def _straightness_px(bending: Bending, film: Film) -> float:
+    """Root mean square over both lines of what the curves leave, the mean of each line aside."""
+    x = np.array(bending.x_mm)
+    inner = np.abs(x) < LENGTH_MM / 2 - 15
+    left = []
+    for found, sign in ((bending.dy_top_mm, 1), (bending.dy_bottom_mm, -1)):
+        truth = bend_mm(x, sign)
+        error = np.array(found) - truth
+        left.append((error - error.mean())[inner])
+    return float(np.sqrt(np.mean(np.square(left))) / film.pixel_mm)
+
+
+def test_stripes_give_the_bending(film):
+    bending = choose_bending(_exposure(film), stripes=[_stripe(film, s) for s in ("top", "bottom")], edges=[], **CHOICE)
+    assert bending.source == "stripes"
+    assert bending.sd_mm < 0.01
+    assert _straightness_px(bending, film) < 0.1
+    # The axis lies midway between the lines, wherever the exposed area was said to lie.
+    means = [bend_mm(X_MM, side).mean() for side in (1, -1)]
+    assert_allclose(bending.y_top_mm, WIDTH_MM / 2 + STRIPE_MM + (means[0] - means[1]) / 2, atol=0.003)
+    assert_allclose(bending.y_top_mm, -bending.y_bottom_mm)
+    assert_allclose(np.mean([bending.dy_top_mm, bending.dy_bottom_mm]), np.mean(means), atol=0.003)
+
+
+def test_without_stripes_the_edges_of_the_format_give_the_bending():
+    film = make_film(np.random.default_rng(9), pixel_mm=0.112, stripes=False)
+    stripes = [_stripe(film, side) for side in ("top", "bottom")]
+    assert max(trace.share for trace in stripes) < 0.3  # nothing there, nothing seen
+    edges = [_edge(film, side) for side in ("top", "bottom")]
+    bending = choose_bending(_exposure(film), stripes=stripes, edges=edges, **CHOICE)
+    assert bending.source == "edges"
+    assert _straightness_px(bending, film) < 0.3
+
+
+def test_nothing_traced_leaves_the_film_as_it_is_with_a_stated_deviation(film):
+    bending = choose_bending(_exposure(film), stripes=[], edges=[], **CHOICE)
+    points = np.array([[10.0, 20.0], [-300.0, -25.0]])
+    assert bending.source == "none"
+    assert bending.sd_mm == CHOICE["none_sd_mm"]
+    assert_array_equal(bending.bent(points), points)
+
+
+def test_one_stripe_bends_both_sides_and_says_it_is_less_sure(film):
+    both = choose_bending(_exposure(film), stripes=[_stripe(film, s) for s in ("top", "bottom")], edges=[], **CHOICE)
+    one = choose_bending(_exposure(film), stripes=[_stripe(film, "top")], edges=[], **CHOICE)
+    assert_allclose(one.dy_top_mm, one.dy_bottom_mm)
+    assert_allclose(np.diff(one.dy_top_mm), np.diff(both.dy_top_mm), atol=1e-9)
+    assert one.sd_mm > 5 * both.sd_mm
+
+
+def test_straightened_stripes_lie_on_one_row(film):
+    exposure = _exposure(film)
+    bending = choose_bending(exposure, stripes=[_stripe(film, s) for s in ("top", "bottom")], edges=[], **CHOICE)
+    grid = film_grid(exposure, half_length_mm=357.0, half_width_mm=32.0)
+    straight = _straightened(film, bending, grid, turned=False)
+    y = grid.y0 + grid.step_y * np.arange(grid.shape[0])
+    for side, place in (("top", bending.y_top_mm), ("bottom", bending.y_bottom_mm)):
+        near = np.abs(y - place) < 1.2
+        columns = straight[near][:, : grid.shape[1] // 9 * 9].reshape(near.sum(), -1, 9).mean(axis=2)
+        x = np.arange(columns.shape[1], dtype=float)
+        trace = trace_ridge(
+            columns.astype(np.float32), y[near], x, side=side, slope_mm=0.02, min_contrast=4.0, outlier_mm=0.05
+        )
+        assert trace.share > 0.95
+        assert np.nanstd(trace.y_mm) < 0.2 * film.pixel_mm
+
+
+def _straightened(film: Film, bending: Bending, grid, *, turned: bool):
+    exposure = _exposure(film)
+    out = np.zeros(grid.shape, np.uint8)
+    for window in tiles(grid.shape, (grid.shape[0], 1500)):
+        source = joined_window(grid, window, exposure, bending, film.image.shape, turned=turned)
+        out[window.slices] = straighten(
+            film.image[source.slices], source, grid, window, exposure, bending, turned=turned
+        )
+    return out
+
+
+def test_a_turned_film_is_the_straight_film_turned(film):
+    exposure = _exposure(film)
+    bending = no_bending(exposure, sd_mm=0.1)
+    grid = film_grid(exposure, half_length_mm=357.0, half_width_mm=27.0)
+    plain, turned = (_straightened(film, bending, grid, turned=t) for t in (False, True))
+    assert np.abs(plain.astype(int) - turned[::-1, ::-1]).max() <= 2
+
+
+def test_a_window_of_the_straight_film_is_where_the_map_says(film):
+    exposure = _exposure(film)
+    bending = Bending("stripes", 0.01, (-372.0, 0.0, 372.0), (0.0, 0.3, -0.1), (0.1, -0.2, 0.2), 30.0, -30.0)
+    grid = film_grid(exposure, half_length_mm=350.0, half_width_mm=27.0)
+    window = Window(100, 180, 2000, 2090)
+    rows, columns = joined_pixels(grid.window(100, 180, 2000, 2090).centres(), exposure, bending, turned=False)
+    source = joined_window(grid, window, exposure, bending, film.image.shape, turned=False)
+    assert source.row0 <= rows.min() - 2
+    assert source.column1 >= columns.max() + 3
+    ramp = np.add.outer(np.arange(source.shape[0]) * 0.5, np.arange(source.shape[1]) * 1.0).astype(np.uint8)
+    found = straighten(ramp, source, grid, window, exposure, bending, turned=False)
+    expected = 0.5 * (rows - source.row0) + (columns - source.column0)
+    assert np.abs(found - expected)[expected < 200].max() < 1.6  # rounding of both, a 32nd of a pixel
+
+
+def test_rail_holes_are_found_to_a_third_of_a_pixel(film):
+    step = 0.112
+    x = np.arange(-200, 200, step)
+    y = np.arange(WIDTH_MM / 2 + 6.4, WIDTH_MM / 2 + 3.0, -step)
+    exposure = _exposure(film)
+    window = band_window(exposure, (float(y[-1]), float(y[0])), film.image.shape)
+    band = band_profiles(
+        film.image[window.slices], window, exposure, x_mm=x, y_mm=y, base_mm=np.zeros(len(x)), samples=1
+    )
+    holes = find_rail_holes(band, x, y, diameter_mm=1.0, spacing_mm=10.0, min_contrast=20.0)
+    assert 37 <= len(holes) <= 41
+    offset = (holes[:, 0] + 5.0) % 10.0 - 5.0
+    assert np.sqrt(np.mean(offset**2)) < 0.3 * step
+    truth = WIDTH_MM / 2 + 4.6 + bend_mm(holes[:, 0], 1)
+    assert np.sqrt(np.mean((holes[:, 1] - truth) ** 2)) < 0.3 * step

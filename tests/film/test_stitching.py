@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from cosp.arrays import ByteArray
+from cosp.errors import InputError, StitchingError
+from cosp.film.arrangement import Arrangement, SeamLimits, arrange, posed
+from cosp.film.stitching import Layout, Seam, compose, lay_out, refine_seam, require_part
+from cosp.geometry.transforms import Rigid
+from cosp.imaging.resampling import sample
+from cosp.imaging.windows import Window
+from tests.film.synthetic import Film, cut, make_film
+
+LIMITS = SeamLimits(
+    overlap_mm=(5, 120), offset_mm=10, feature_pixel_mm=0.28, ratio=0.85, min_features=15, min_margin=2.0
+)
+GAINS = (1.0, 0.9, 1.1)
+
+
+@pytest.fixture(scope="module")
+def film() -> Film:
+    return make_film(np.random.default_rng(4), pixel_mm=0.14, length_mm=300.0, leader_mm=8.0)
+
+
+@pytest.fixture(scope="module")
+def scanned(film: Film) -> tuple[list[ByteArray], list[Rigid]]:
+    return cut(
+        film,
+        np.random.default_rng(5),
+        overlaps_mm=(30.0, 14.0),
+        rotations_deg=(0.1, -0.4, 0.5),
+        gains=GAINS,
+    )
+
+
+@pytest.fixture(scope="module")
+def joined(scanned: tuple[list[ByteArray], list[Rigid]]) -> tuple[Arrangement, list[Seam], Layout]:
+    parts, _ = scanned
+    arrangement = _arranged(parts)
+    seams = _seams(parts, arrangement)
+    return arrangement, seams, lay_out([p.shape for p in parts], seams, feather_px=12.0)
+
+
+def _arranged(parts: list[ByteArray], names: str = "abcd") -> Arrangement:
+    return arrange(parts, names=list(names), pixel_mm=0.14, limits=LIMITS, rng=np.random.default_rng(0))
+
+
+def _seams(parts: list[ByteArray], arrangement: Arrangement) -> list[Seam]:
+    laid = [posed(parts[i], pose) for i, pose in zip(arrangement.order, arrangement.poses, strict=True)]
+    return [
+        refine_seam(
+            laid[k],
+            laid[k + 1],
+            coarse,
+            min_score=0.5,
+            min_inliers=10,
+            names=("a", "b"),
+            rng=np.random.default_rng(0),
+            threads=1,
+        )
+        for k, coarse in enumerate(arrangement.seams)
+    ]
+
+
+def _worst_px(motion: Rigid, truth: Rigid, shape: tuple[int, ...], overlap_px: int) -> float:
+    """Largest difference of two motions over the overlap."""
+    corners = np.array([[x, y] for x in (0, overlap_px) for y in (0, shape[0])], float)
+    return float(np.linalg.norm(motion.apply(corners) - truth.apply(corners), axis=1).max())
+
+
+def test_seams_are_found_within_a_twentieth_of_a_pixel(scanned, joined):
+    parts, motions = scanned
+    _, seams, _ = joined
+    for k, seam in enumerate(seams):
+        truth = motions[k].inverse().after(motions[k + 1])
+        assert _worst_px(seam.motion, truth, parts[k].shape, seam.overlap_px) < 0.05
+        # Grain of one grey level and interpolation leave something, but little.
+        assert 0.001 < seam.rms_px < 0.1
+        assert seam.check_rms_px < 0.1
+
+
+def test_brightness_of_the_parts_is_balanced(joined, scanned):
+    _, seams, layout = joined
+    for k, seam in enumerate(seams):
+        assert_allclose(seam.gain, GAINS[k] / GAINS[k + 1], rtol=0.01)
+    gains = np.array([g for g, _ in layout.greys])
+    assert_allclose(gains * GAINS, (gains * GAINS).mean(), rtol=0.01)
+    assert_allclose(np.log(gains).mean(), 0.0, atol=1e-12)
+
+
+def test_the_joined_film_is_the_film_that_was_cut(film, joined, scanned):
+    parts, motions = scanned
+    _, _, layout = joined
+    whole = compose(parts, layout, Window(0, layout.shape[0], 0, layout.shape[1]))
+    # Joined film -> part a -> film, at places over the whole picture, joints included.
+    rng = np.random.default_rng(1)
+    back = motions[0].after(layout.motions[0].inverse())
+    xy = np.column_stack([rng.uniform(100, film.image.shape[1] - 100, 40), rng.uniform(180, 380, 40)])
+    for joint in layout.joints_px:
+        xy = np.vstack([xy, [[joint, y] for y in (180.0, 280.0, 380.0)]])
+    for x, y in xy:
+        r, c = np.mgrid[-12:13, -12:13]
+        here = back.inverse().apply(np.array([x, y]))
+        grid = back.apply(np.stack([c + np.rint(here[0]), r + np.rint(here[1])], axis=-1))
+        expected = sample(film.image.astype(np.float32), grid[..., 1], grid[..., 0])
+        rows, columns = r + round(here[1]), c + round(here[0])
+        found = whole[rows, columns].astype(float)
+        # Contrast may differ by the balance, structure may not: a ghost of 0.3 px would cost several per cent.
+        assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.985
+
+
+def test_windows_of_the_joined_film_agree_with_the_whole(joined, scanned):
+    parts, _ = scanned
+    _, _, layout = joined
+    whole = compose(parts, layout, Window(0, layout.shape[0], 0, layout.shape[1]))
+    joint = round(layout.joints_px[0])
+    window = Window(37, 300, joint - 101, joint + 77)
+    # Places are rounded to a 32nd of a pixel, which a steep edge shows.
+    assert np.abs(whole[window.slices].astype(int) - compose(parts, layout, window)).max() <= 3
+
+
+def test_parts_back_to_front_are_put_in_order(scanned):
+    parts, _ = scanned
+    assert _arranged(parts[::-1]).order == (2, 1, 0)
+
+
+def test_a_film_of_one_part_passes_through_unchanged(film):
+    arrangement = _arranged([film.image])
+    layout = lay_out([film.image.shape], [], feather_px=10.0)
+    assert arrangement.seams == ()
+    rows, columns = film.image.shape
+    assert_array_equal(compose([film.image], layout, Window(0, rows, 0, columns)), film.image)
+
+
+@pytest.mark.slow
+def test_shuffled_turned_and_mirrored_parts_are_put_right(scanned):
+    parts, _ = scanned
+    shuffled = [parts[2], np.ascontiguousarray(parts[0][::-1, ::-1]), np.ascontiguousarray(parts[1][::-1])]
+    arrangement = _arranged(shuffled)
+    laid = [posed(shuffled[i], pose) for i, pose in zip(arrangement.order, arrangement.poses, strict=True)]
+    assert arrangement.order == (1, 2, 0)
+    for found, expected in zip(laid, parts, strict=True):
+        assert_array_equal(found, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chosen", [(0, 0, 0), (0, 2)], ids=["one part given thrice", "one part missing"])
+def test_parts_that_do_not_join_are_refused_by_name(scanned, chosen):
+    parts, _ = scanned
+    with pytest.raises(StitchingError, match="seam [a-c] - [a-c]"):
+        _arranged([parts[i] for i in chosen])
+
+
+def test_a_blank_overlap_is_refused_by_name(scanned, joined):
+    parts, _ = scanned
+    arrangement, _, _ = joined
+    blank = np.random.default_rng(2).integers(100, 104, parts[1].shape).astype(np.uint8)
+    with pytest.raises(StitchingError, match="seam a - b"):
+        _seams([parts[0], blank, parts[2]], arrangement)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"dtype": "uint16"}, "1 band.s. of uint16"),
+        ({"bands": 3}, "3 band.s. of uint8"),
+        ({"shape": (500, 400)}, "longer along its columns"),
+        ({"pixel_mm": 0.014}, "is pixel_um right"),
+    ],
+)
+def test_a_raster_that_is_no_part_is_named(change, said):
+    good = {"shape": (10000, 30000), "bands": 1, "dtype": "uint8", "pixel_mm": 0.007}
+    require_part("film_a.tif", **good, width_mm=(60.0, 110.0))
+    with pytest.raises(InputError, match=f"film_a.tif.*{said}"):
+        require_part("film_a.tif", **{**good, **change}, width_mm=(60.0, 110.0))

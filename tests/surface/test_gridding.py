@@ -1,0 +1,138 @@
+"""Claims about points turned into a raster of heights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from cosp.geometry.grids import PixelGrid
+from cosp.surface.gridding import HALO_CELLS, boxes_meeting, grid_points, map_boxes
+from tests.surface.synthetic import ORIGIN
+
+CHOICES = {"kernel_cells": 0.5, "gate_sigmas": 5.0, "point_sigma_m": 1.5, "points_per_independent": 1.0}
+GRID = PixelGrid.covering((600_000, 5_200_000, 600_600, 5_200_500), 10.0)
+
+
+def plane(xy):
+    return 1500 + 0.6 * (xy[..., 0] - 600_000) - 0.9 * (xy[..., 1] - 5_200_000)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(17)
+
+
+def scattered(rng, count=20_000, bounds=(600_000, 5_200_000, 600_600, 5_200_500)):
+    xmin, ymin, xmax, ymax = bounds
+    xy = np.stack([rng.uniform(xmin, xmax, count), rng.uniform(ymin, ymax, count)], axis=-1)
+    return np.concatenate([xy, plane(xy)[:, None]], axis=-1)
+
+
+def test_a_steep_plane_is_recovered_however_unevenly_the_points_lie(rng):
+    points = scattered(rng)
+    found = grid_points(points, GRID, **CHOICES)
+    error = found.height_m - plane(GRID.centres())
+    assert np.isfinite(error).all()
+    # Points lie up to 10 m of height from their cell's centre: a mean of them would be metres off.
+    assert np.abs(error[1:-1, 1:-1]).max() < 0.05
+    assert np.abs(error).max() < 0.5
+
+
+def test_gross_errors_leave_no_trace_up_to_a_fifth_of_the_points(rng):
+    points = scattered(rng)
+    points[:, 2] += rng.normal(0, 1.5, len(points))
+    clean = grid_points(points, GRID, **CHOICES).height_m - plane(GRID.centres())
+    wrong = rng.random(len(points)) < 0.2
+    points[wrong, 2] += rng.choice([-1, 1], wrong.sum()) * rng.uniform(100, 800, wrong.sum())
+    error = grid_points(points, GRID, **CHOICES).height_m - plane(GRID.centres())
+    assert np.isfinite(error).mean() > 0.995
+    usual = np.nanstd(clean)
+    assert 0.3 < usual < 1.5
+    assert np.nanpercentile(np.abs(error), 99) < 6 * usual
+
+
+def test_the_stated_standard_deviation_is_that_of_the_heights(rng):
+    points = scattered(rng)
+    points[:, 2] += rng.normal(0, 3.0, len(points))
+    found = grid_points(points, GRID, **CHOICES)
+    ratio = (found.height_m - plane(GRID.centres()))[1:-1, 1:-1] / found.sigma_m[1:-1, 1:-1]
+    assert 0.8 < ratio.std() < 1.3
+
+
+def test_neighbours_that_err_together_make_the_standard_deviation_larger(rng):
+    points = scattered(rng)
+    alone = grid_points(points, GRID, **CHOICES).sigma_m
+    together = grid_points(points, GRID, **(CHOICES | {"points_per_independent": 4.0})).sigma_m
+    assert_allclose(np.median(together / alone), 2.0, rtol=0.15)
+    assert together.max() <= np.float32(1.5)  # never worse than a single point
+
+
+def test_matching_noise_is_the_least_that_is_claimed(rng):
+    found = grid_points(scattered(rng), GRID, **CHOICES)  # without any noise
+    # 1.5 m over the root of the points of a cell, seven on average, and some of its neighbours'
+    assert found.sigma_m.min() > 1.5 / np.sqrt(60)
+    assert found.sigma_m.max() <= np.float32(1.5)
+
+
+def test_a_slope_turned_away_from_the_lens_has_no_holes(rng):
+    # Foreshortened: points 18 m apart across 10 m cells in one direction, 3 m in the other.
+    x, y = np.meshgrid(np.arange(600_000.5, 600_600, 18.0), np.arange(5_200_000.5, 5_200_500, 3.0))
+    xy = np.stack([x.ravel(), y.ravel()], axis=-1)
+    points = np.concatenate([xy, plane(xy)[:, None]], axis=-1)
+    found = grid_points(points, GRID, **CHOICES)
+    inner = found.height_m[2:-2, 2:-2]
+    assert (found.count[2:-2, 2:-2] == 0).mean() > 0.3  # many cells hold no point of their own
+    assert np.isfinite(inner).all()
+    assert np.abs(inner - plane(GRID.centres())[2:-2, 2:-2]).max() < 1.0
+
+
+def test_a_tiny_hole_is_filled_and_a_larger_one_is_not(rng):
+    points = scattered(rng)
+    rows, columns = (np.rint(v).astype(int) for v in GRID.pixels(points[:, :2]))
+    tiny = (rows == 20) & (columns == 20)
+    large = (abs(rows - 35) <= 2) & (abs(columns - 40) <= 2)
+    found = grid_points(points[~tiny & ~large], GRID, **CHOICES)
+    assert abs(found.height_m[20, 20] - plane(GRID.centres())[20, 20]) < 0.5
+    assert found.count[20, 20] == 0
+    assert np.isnan(found.height_m[34:37, 39:42]).all()
+
+
+def test_the_model_does_not_grow_beyond_its_points(rng):
+    points = scattered(rng, bounds=(600_200, 5_200_200, 600_400, 5_200_400))
+    found = grid_points(points, GRID, **CHOICES)
+    outside = np.ones(GRID.shape, bool)
+    outside[10:30, 20:40] = False
+    assert np.isnan(found.height_m[outside]).all()
+    assert np.isfinite(found.height_m[~outside]).all()
+
+
+def test_tiles_with_a_halo_give_the_heights_of_the_whole(rng):
+    points = scattered(rng, count=4000)
+    points[:, 2] += rng.normal(0, 3, len(points))
+    points[::50, 2] += 300
+    whole = grid_points(points, GRID, **CHOICES)
+    part = GRID.window(10 - HALO_CELLS, 30 + HALO_CELLS, 20 - HALO_CELLS, 45 + HALO_CELLS)
+    tile = grid_points(points, part, **CHOICES)
+    inner = (slice(HALO_CELLS, -HALO_CELLS), slice(HALO_CELLS, -HALO_CELLS))
+    assert_allclose(tile.height_m[inner], whole.height_m[10:30, 20:45], atol=1e-3)
+    assert_allclose(tile.sigma_m[inner], whole.sigma_m[10:30, 20:45], atol=1e-3)
+    assert np.array_equal(tile.count[inner], whole.count[10:30, 20:45])
+
+
+def test_no_points_make_an_empty_model():
+    found = grid_points(np.empty((0, 3)), GRID, **CHOICES)
+    assert np.isnan(found.height_m).all()
+    assert not found.count.any()
+
+
+def test_boxes_on_the_map_hold_all_that_the_local_boxes_held(rng):
+    low = np.array([[-60_000.0, -3000, 0], [20_000, 1000, 500]])
+    high = low + [2000.0, 4000, 1500]
+    map_frame, boxes = map_boxes(ORIGIN, "EPSG:32632", low, high)
+    for k in range(2):
+        inside = map_frame.map_from_local(rng.uniform(low[k], high[k], (500, 3)))
+        assert (inside[:, :2] >= boxes[k, :2] - 0.5).all()
+        assert (inside[:, :2] <= boxes[k, 2:] + 0.5).all()
+    assert boxes_meeting(boxes, tuple(boxes[1])) == [1]
+    assert boxes_meeting(boxes, (boxes[:, 0].min(), boxes[:, 1].min(), boxes[:, 2].max(), boxes[:, 3].max())) == [0, 1]

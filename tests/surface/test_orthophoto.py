@@ -1,0 +1,171 @@
+"""Claims about film brought onto the map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from cosp.camera.mapping import MapProjector
+from cosp.geometry.grids import PixelGrid
+from cosp.imaging.windows import Window
+from cosp.surface.orthophoto import (
+    direction_to_lens,
+    fill_heights,
+    film_window,
+    heights_on,
+    hidden_from_lens,
+    nearest_on,
+    sample_film,
+)
+from tests.surface.synthetic import ORIGIN, camera, terrain_m, texture
+
+CRS = "EPSG:32632"
+FILM_GRID = PixelGrid(-29.96, 10.0, 0.07, -0.07, (286, 857))
+
+
+@pytest.fixture(scope="module")
+def fore():
+    return camera("fore")
+
+
+@pytest.fixture(scope="module")
+def grid(fore):
+    centre = fore.locate_geodetic(np.array([0.0, 0.0]), 1500.0)
+    projector = MapProjector(fore, CRS, (0, 0, 1, 1))
+    east, north, _ = projector.map_frame.map_from_geodetic(centre)
+    return PixelGrid.covering((east - 5000, north - 2000, east + 5000, north + 2000), 25.0)
+
+
+@pytest.fixture(scope="module")
+def exposed(fore, grid):
+    """A film of the textured terrain, by rays; and the mapping."""
+    projector = MapProjector(fore, CRS, grid.bounds)
+    to_map = projector.map_frame
+    film_mm = FILM_GRID.centres()
+
+    def height_at(lonlat):
+        place = to_map.map_from_geodetic(np.concatenate([lonlat, np.zeros((*lonlat.shape[:-1], 1))], axis=-1))
+        return terrain_m(place[..., 0], place[..., 1])
+
+    ground = to_map.map_from_geodetic(ORIGIN.geodetic_from_local(fore.locate_on(film_mm, height_at, iterations=5)))
+    return np.clip(np.rint(texture(ground[..., 0], ground[..., 1])), 1, 255).astype(np.uint8), projector
+
+
+def test_the_orthophoto_shows_the_texture_of_the_ground(exposed, grid):
+    film, projector = exposed
+    xy = grid.centres()
+    film_mm = projector.film(xy[..., 0], xy[..., 1], terrain_m(xy[..., 0], xy[..., 1]))
+    ortho = sample_film(film, FILM_GRID, film_mm, np.zeros(grid.shape, bool))
+    assert (ortho > 0).all()
+    error = ortho.astype(float) - texture(xy[..., 0], xy[..., 1])
+    assert np.sqrt(np.mean(error**2)) < 1.5  # rounding to grey values and a film pixel of 22 m
+    # A height wrong by 100 m moves the ground by 27 m: the proof would notice.
+    moved = projector.film(xy[..., 0], xy[..., 1], terrain_m(xy[..., 0], xy[..., 1]) + 100)
+    wrong = sample_film(film, FILM_GRID, moved, np.zeros(grid.shape, bool)).astype(float) - texture(
+        *np.moveaxis(xy, -1, 0)
+    )
+    assert np.sqrt(np.mean(wrong**2)) > 4
+
+
+def test_a_window_of_the_film_gives_the_same_grey_values(exposed, grid):
+    film, projector = exposed
+    xy = grid.window(40, 60, 100, 150).centres()
+    film_mm = projector.film(xy[..., 0], xy[..., 1], 1500.0)
+    window = film_window(FILM_GRID, film_mm)
+    part = FILM_GRID.window(window.row0, window.row1, window.column0, window.column1)
+    shown = np.zeros((20, 50), bool)
+    assert np.array_equal(
+        sample_film(film[window.slices], part, film_mm, shown), sample_film(film, FILM_GRID, film_mm, shown)
+    )
+    assert film_window(FILM_GRID, film_mm + 500) is None
+    assert film_window(FILM_GRID, np.full((3, 2), np.nan)) is None
+
+
+def test_off_the_film_and_dark_leader_are_no_data(exposed):
+    film, _ = exposed
+    film = film.copy()
+    film[:, :100] = 0
+    film_mm = np.array([[-29.0, 0.0], [0.0, 0.0], [35.0, 0.0], [np.nan, 0.0]])
+    grey = sample_film(film, FILM_GRID, film_mm, np.zeros(4, bool))
+    assert (grey > 0).tolist() == [False, True, False, False]
+
+
+def test_ground_behind_a_wall_is_hidden_as_far_as_the_shadow_reaches():
+    grid = PixelGrid.covering((0, 0, 1000, 400), 10.0)
+    heights = np.zeros(grid.shape, np.float32)
+    heights[:, 50] = 100.0  # a wall along north, 100 m high
+    # The lens stands to the east, 0.7 m of way per metre of height: the wall hides 70 m of ground to its west.
+    east, north = np.full(grid.shape, 0.7), np.zeros(grid.shape)
+    hidden = hidden_from_lens(heights, Window(0, *grid.shape[:1], 0, 100), grid, east, north, tolerance_m=0.5)
+    assert hidden[20].nonzero()[0].tolist() == list(range(44, 50))
+    part = Window(10, 20, 40, 60)
+    assert np.array_equal(
+        hidden_from_lens(heights, part, grid, east[part.slices], north[part.slices], tolerance_m=0.5),
+        hidden[part.slices],
+    )
+    lower = hidden_from_lens(heights, part, grid, 0 * east[part.slices], north[part.slices], tolerance_m=0.5)
+    assert not lower.any()
+
+
+def test_missing_heights_hide_nothing():
+    grid = PixelGrid.covering((0, 0, 500, 500), 10.0)
+    heights = np.full(grid.shape, np.nan, np.float32)
+    heights[:, :20] = 100
+    slant = np.full(grid.shape, 0.5)
+    whole = Window(0, 50, 0, 50)
+    assert not hidden_from_lens(heights, whole, grid, slant, slant, tolerance_m=0.0).any()
+    assert not hidden_from_lens(heights * np.nan, whole, grid, slant, slant, tolerance_m=0.0).any()
+
+
+def test_hidden_cells_are_those_whose_ray_meets_other_terrain_first(fore):
+    """Cliffs far out on the scan, against a fine march along the camera's own rays."""
+    place = fore.locate_geodetic(np.array([330.0, 5.0]), 1000.0)
+    map_frame = MapProjector(fore, CRS, (0, 0, 1, 1)).map_frame
+    east, north, _ = map_frame.map_from_geodetic(place)
+    grid = PixelGrid.covering((east - 800, north - 600, east + 800, north + 600), 20.0)
+    xy = grid.centres()
+    heights = (1000 + 600 * (np.sin((xy[..., 0] - east) / 120) > 0.3)).astype(np.float32)
+    projector = MapProjector(fore, CRS, grid.bounds)
+
+    def film_of(points, height):
+        return projector.film(points[..., 0], points[..., 1], height)
+
+    def locate(film_mm, height):
+        return projector.map_frame.map_from_local(fore.locate(film_mm, height))[..., :2]
+
+    slant = direction_to_lens(locate, grid, film_of)
+    hidden = hidden_from_lens(heights, Window(0, *grid.shape[:1], 0, grid.shape[1]), grid, *slant, tolerance_m=1.0)
+    film = film_of(xy, heights)
+    blocked = np.zeros(grid.shape, bool)
+    for up in np.arange(5.0, 600.0, 5.0):
+        rows, columns = grid.pixels(locate(film, heights + up))
+        inside = (rows >= 0) & (rows <= grid.shape[0] - 1) & (columns >= 0) & (columns <= grid.shape[1] - 1)
+        at = heights[
+            np.clip(np.rint(rows), 0, grid.shape[0] - 1).astype(int),
+            np.clip(np.rint(columns), 0, grid.shape[1] - 1).astype(int),
+        ]
+        blocked |= inside & (at > heights + up + 1.0)
+    assert 0.05 < blocked.mean() < 0.6
+    assert (hidden == blocked).mean() > 0.93  # the rest are cells at the edge of shadows
+
+
+def test_heights_at_a_finer_posting_lie_on_the_model(grid):
+    xy = grid.centres()
+    tilted = (0.1 * (xy[..., 0] - grid.x0) + 0.2 * (xy[..., 1] - grid.y0)).astype(np.float32)
+    fine = PixelGrid.covering((*xy[30, 40], *(xy[30, 40] + 300)), 5.0)
+    below, heights = heights_on(tilted, grid, fine)
+    at = fine.centres()
+    assert_allclose(heights, 0.1 * (at[..., 0] - grid.x0) + 0.2 * (at[..., 1] - grid.y0), atol=0.2)
+    marks = np.zeros(below.shape, bool)
+    assert not nearest_on(marks, grid.window(below.row0, below.row1, below.column0, below.column1), fine).any()
+    same, unchanged = heights_on(tilted, grid, grid)
+    assert_allclose(unchanged, tilted, atol=1e-3)
+    assert same.shape == grid.shape
+
+
+def test_holes_are_filled_at_the_level_of_their_surroundings():
+    reference = np.arange(100.0).reshape(10, 10)
+    ours = (reference + 7).astype(np.float32)
+    ours[4:6, 4:6] = np.nan
+    assert_allclose(fill_heights(ours, reference), reference + 7)
