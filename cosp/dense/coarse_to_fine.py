@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cosp.arrays import ByteArray, Float32Array
+from cosp.arrays import BoolArray, ByteArray, Float32Array
 from cosp.dense.aggregation import aggregate_costs
 from cosp.dense.census import left_census, right_census
-from cosp.dense.resampling import SmoothField, median_of_given, picture_pyramid, prior_of, resample_right
+from cosp.dense.resampling import SmoothField, fill_holes, median_of_given, picture_pyramid, prior_of, resample_right
 from cosp.dense.selection import DisparityMap, select_disparities
-from cosp.dense.validity import Validity, no_data, picture_validity, speckles
+from cosp.dense.validity import Validity, correlation, no_data, picture_validity, speckles
 from cosp.imaging.windows import Window, tiles
 
 _log = logging.getLogger(__name__)
@@ -94,6 +94,7 @@ def match(
     large_step: int,
     least_texture_sd: float,
     saturated_from: int,
+    least_correlation: float,
     largest_speckle_px: int,
     speckle_step_px: float,
     threads: int,
@@ -115,6 +116,8 @@ def match(
         Standard deviation within 9 x 9 px below which a pixel is masked.
     saturated_from : int
         Grey value from which film counts as saturated; a pixel is masked where most of the 9 x 9 px are.
+    least_correlation : float
+        Correlation of the pictures within 15 x 15 px, the disparity taken out, below which a pixel is masked.
     largest_speckle_px, speckle_step_px
         Islands of up to so many pixels, cut off by steps of more than so much, are masked.
     y_parallax : SmoothField, px
@@ -172,7 +175,10 @@ def match(
     def finish(window: Window) -> None:
         grown = window.grown(HALO_PX, left.shape)
         tile = _cleaned(
+            last,
+            grown,
             _matched(last, grown, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
+            least_correlation=least_correlation,
             largest_speckle_px=largest_speckle_px,
             speckle_step_px=speckle_step_px,
         )
@@ -238,19 +244,41 @@ def _matched(
 
 
 def _cleaned(
+    task: _Task,
+    window: Window,
     tile: DisparityMap,
     *,
+    least_correlation: float,
     largest_speckle_px: int,
     speckle_step_px: float,
 ) -> DisparityMap:
-    """Median of 5 x 5, islands masked, disparities rounded."""
+    """Median of 5 x 5, what does not correlate and islands masked, disparities rounded."""
     disparity = median_of_given(tile.disparity)
+    unlike = _unlike(task, window, disparity, least_correlation)
+    disparity[unlike] = np.nan
     islands = speckles(disparity, largest_speckle_px=largest_speckle_px, speckle_step_px=speckle_step_px)
     disparity[islands] = np.nan
     np.rint(disparity * FRACTIONS, out=disparity)
     disparity /= FRACTIONS
     validity = tile.validity | islands.view(np.uint8) * np.uint8(Validity.SPECKLE)
+    validity |= unlike.view(np.uint8) * np.uint8(Validity.LOW_CORRELATION)
     return DisparityMap(disparity, validity, tile.confidence)
+
+
+def _unlike(task: _Task, window: Window, disparity: Float32Array, least_correlation: float) -> BoolArray:
+    """Where a disparity was found, but the pictures it brings together do not look alike."""
+    given = ~np.isnan(disparity)
+    if not given.any():
+        return given
+    right = resample_right(
+        task.right,
+        fill_holes(disparity),
+        window.row0,
+        window.column0,
+        y_parallax=task.y_parallax,
+        level=task.step.level,
+    )
+    return np.asarray(given & (correlation(task.left[window.slices], right) < least_correlation))
 
 
 def strip_alignment_px(span_px: float) -> int:

@@ -5,11 +5,15 @@ from __future__ import annotations
 from enum import IntFlag
 from typing import Any
 
+import cv2
 import numpy as np
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from cosp.dense import kernels
 from cosp.geometry.statistics import summarise
+
+CORRELATION_WINDOW_PX = 15
+"""Side of the window in which the two pictures must look alike."""
 
 TEXTURE_WINDOW_PX = 9
 """Side of the window in which texture is measured: the census looks as far."""
@@ -25,6 +29,7 @@ class Validity(IntFlag):
     SATURATED = 16
     AT_RANGE_EDGE = 32  # the cheapest disparity was the first or last that was searched
     SPECKLE = 64
+    LOW_CORRELATION = 128  # the pictures do not look alike there: grain on snow, or a match beyond the edge
 
 
 def no_data(image: ByteArray, flag: Validity) -> ByteArray:
@@ -52,6 +57,24 @@ def picture_validity(
         bits,
     )
     return bits
+
+
+def correlation(left: ByteArray, right: ByteArray) -> Float32Array:
+    """Normalised correlation of two pictures in the window about every pixel; 0 where one is flat.
+
+    Grain and noise of two films have nothing in common, so this tells texture from what only looks like it.
+    """
+    size = (CORRELATION_WINDOW_PX, CORRELATION_WINDOW_PX)
+    first, second = left.astype(np.float32), right.astype(np.float32)
+
+    def mean(values: Float32Array) -> Float32Array:
+        return np.asarray(cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_REFLECT), np.float32)
+
+    first_mean, second_mean = mean(first), mean(second)
+    covariance = mean(first * second) - first_mean * second_mean
+    variances = (mean(first * first) - first_mean**2) * (mean(second * second) - second_mean**2)
+    # A variance of a quarter grey value squared is the rounding of a flat picture.
+    return np.asarray(covariance / np.sqrt(np.maximum(variances, 0.0625)), np.float32)
 
 
 def speckles(disparity: Float32Array, *, largest_speckle_px: int, speckle_step_px: float) -> BoolArray:

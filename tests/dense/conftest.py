@@ -13,6 +13,7 @@ def settings():
         "large_step": 64,
         "least_texture_sd": 2.0,
         "saturated_from": 250,
+        "least_correlation": 0.35,
         "largest_speckle_px": 100,
         "speckle_step_px": 1.5,
         "threads": 1,

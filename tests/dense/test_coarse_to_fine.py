@@ -176,11 +176,16 @@ def test_disparities_are_whole_fractions_and_missing_exactly_where_they_are_inva
 
 def test_confidence_is_lower_where_matches_are_wrong(ground, slope, settings):
     grainy = render(ground, slope, gain=8.0, grain=8.0, rng=np.random.default_rng(1))
-    found = match(grainy.left, grainy.right, (0, 48), **settings)
+    found = match(grainy.left, grainy.right, (0, 48), **{**settings, "least_correlation": -1.0})
     given = grainy.seen & (found.validity == 0)
     wrong = given & (np.abs(found.disparity - grainy.disparity) > 1)
     assert wrong.sum() > 200
     assert np.median(found.confidence[wrong]) < 0.8 * np.median(found.confidence[given & ~wrong])
+
+    checked = match(grainy.left, grainy.right, (0, 48), **settings)
+    kept = checked.validity == 0
+    assert (wrong & kept).sum() < 0.6 * wrong.sum()
+    assert (given & ~wrong & kept).sum() > 0.8 * (given & ~wrong).sum()
 
 
 def test_the_range_searched_grows_by_levels_and_not_by_work():

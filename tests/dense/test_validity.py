@@ -3,7 +3,14 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy import ndimage
 
-from cosp.dense.validity import TEXTURE_WINDOW_PX, Validity, picture_validity, speckles, summarise_disparity
+from cosp.dense.validity import (
+    TEXTURE_WINDOW_PX,
+    Validity,
+    correlation,
+    picture_validity,
+    speckles,
+    summarise_disparity,
+)
 
 
 def test_texture_and_saturation_are_those_of_the_window_around():
@@ -58,3 +65,17 @@ def test_the_summary_counts_bits_and_what_both_pictures_see():
     assert summary["share_by_bit"]["no_data_right"] == 0.2
     assert summary["share_by_bit"]["saturated"] == 0.2
     assert summary["disparity_px"]["median"] == 2
+
+
+def test_grain_of_two_films_does_not_correlate_and_shared_texture_does():
+    rng = np.random.default_rng(5)
+    texture = rng.normal(0, 12, (80, 80))
+    left, right = (
+        np.clip(128 + gain * texture + rng.normal(0, 6, (80, 80)), 1, 255).astype(np.uint8) for gain in (1.0, 0.7)
+    )
+    expected = 0.7 * 144 / np.sqrt((144 + 36) * (0.49 * 144 + 36))  # covariance over standard deviations
+    found = correlation(left, right)[10:-10, 10:-10]
+    assert abs(found.mean() - expected) < 0.03
+    grain, other_grain = (np.clip(240 + rng.normal(0, 6, (80, 80)), 1, 255).astype(np.uint8) for _ in range(2))
+    assert np.abs(correlation(grain, other_grain)).max() < 0.35
+    assert np.abs(correlation(np.full((30, 30), 255, np.uint8), left[:30, :30])).max() < 0.02  # rounding
