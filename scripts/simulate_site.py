@@ -1,11 +1,10 @@
 """Make the ground of a simulated site: terrain of both epochs, reference data, outlines, sheets and truth."""
 
 import logging
-from pathlib import Path
 
 import numpy as np
 
-from cosp.io import heights, rasters, records
+from cosp.io import heights, rasters, records, vectors
 from cosp.io.logs import log_to
 from cosp.simulation import description
 from cosp.simulation.reference import make_reference_dem, make_reference_image, unstable_polygons
@@ -63,14 +62,12 @@ def simulate_site(
     rasters.write(reference_image_path, image, grid=image_grid, crs=plan.crs, nodata=0)
     log.info("reference DEM and image done")
 
-    outlines = unstable_polygons(plan, terrain)
-    Path(unstable_path).unlink(missing_ok=True)
-    outlines.to_file(unstable_path, driver="GPKG", layer="unstable_terrain")
+    vectors.write(unstable_path, unstable_polygons(plan, terrain), "unstable_terrain")
     records.write(truth_path, site_truth(plan))
     config = description.site_config(plan, scenes=str(scenes_path), pairs=str(pairs_path))
-    Path(scenes_path).write_text(description.scene_sheet(plan), encoding="utf-8")
-    Path(pairs_path).write_text(description.pair_sheet(plan), encoding="utf-8")
-    Path(config_path).write_text(description.config_text(config), encoding="utf-8")
+    records.write_text(scenes_path, description.scene_sheet(plan))
+    records.write_text(pairs_path, description.pair_sheet(plan))
+    records.write_text(config_path, description.config_text(config))
 
 
 if __name__ == "__main__":

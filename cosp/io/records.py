@@ -23,10 +23,15 @@ def write(path: str | Path, record: Any) -> None:
 
     A record's file starts with its `kind` and `version`. Numbers that are not finite become null.
     """
+    write_text(path, json.dumps(as_plain(record), indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8, whole or not at all."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    temporary.write_text(json.dumps(as_plain(record), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import geopandas as gpd
 import numpy as np
+import pyogrio
 from pyogrio.errors import DataSourceError
 from rasterio.features import rasterize
 
@@ -13,6 +15,8 @@ from cosp.arrays import BoolArray
 from cosp.errors import InputError
 from cosp.geometry.grids import PixelGrid
 from cosp.io.rasters import _transform_of
+
+_GEOPACKAGE_DATE = "2000-01-01T00:00:00.000Z"  # a GeoPackage says when it was changed; products must not
 
 
 def read(path: str | Path, crs: str) -> gpd.GeoDataFrame:
@@ -30,6 +34,20 @@ def read(path: str | Path, crs: str) -> gpd.GeoDataFrame:
     if features.crs is None:
         raise InputError(f"{path}: the polygons have no coordinate reference system")
     return features.to_crs(crs)
+
+
+def write(path: str | Path, features: gpd.GeoDataFrame, layer: str) -> None:
+    """Write a GeoPackage, whole or not at all; the same features give the same bytes."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _GEOPACKAGE_DATE})
+    try:
+        features.to_file(temporary, driver="GPKG", layer=layer, engine="pyogrio")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
 def rasterise(path: str | Path, grid: PixelGrid, crs: str) -> BoolArray:

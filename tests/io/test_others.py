@@ -1,5 +1,7 @@
 """Tables, polygons, geoids, logs."""
 
+import time
+
 import geopandas as gpd
 import numpy as np
 import pandas as pd
@@ -32,6 +34,15 @@ def test_polygons_of_another_reference_system_fall_where_they_should(tmp_path):
     assert (columns.min(), columns.max()) in {(2, 4), (1, 5), (2, 5), (1, 4)}
     assert abs(mask.sum() - 15) <= 20
     assert mask[7, 3]
+
+
+def test_polygons_written_twice_are_the_same_bytes(tmp_path):
+    square = gpd.GeoDataFrame(geometry=[shapely.box(600_020, 5_199_900, 600_050, 5_199_950)], crs="EPSG:32632")
+    for name in ("a.gpkg", "b.gpkg"):
+        vectors.write(tmp_path / name, square, "lake")
+        time.sleep(1.1)  # the format's clock has seconds
+    assert (tmp_path / "a.gpkg").read_bytes() == (tmp_path / "b.gpkg").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.gpkg", "b.gpkg"]
 
 
 def test_no_polygons_is_an_error_that_names_the_file(tmp_path):
