@@ -9,7 +9,7 @@ from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Footprint
 from cosp.matching.ground import control_tiles, map_crs, match_strip
 from cosp.matching.matchers import matcher_by_name
-from cosp.matching.relief import relief_reference
+from cosp.matching.relief import relief_reference, relief_sigma_m
 
 
 def match_tiles(
@@ -63,6 +63,7 @@ def match_tiles(
         search_px=search_px,
         threads=threads,
     )
+    sigma_m = matches.sigma_m if reference_image_path else relief_sigma_m(matches.sigma_m, posting_m)
     lonlath = matches.lonlath(crs)
     table = {
         "x_mm": matches.film_mm[:, 0],
@@ -70,7 +71,7 @@ def match_tiles(
         "longitude_deg": lonlath[:, 0],
         "latitude_deg": lonlath[:, 1],
         "score": matches.score,
-        "sigma_px": matches.sigma_m / pixel_m,
+        "sigma_px": sigma_m / pixel_m,
         "posting_m": posting_m,
     }
     tables.write(matches_path, pd.DataFrame(table))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
@@ -73,12 +74,15 @@ def _ncc_of_batch(templates: FloatArray, searches: FloatArray) -> Float32Array:
     spectrum = np.conj(fft.rfft2(template, s=size)) * fft.rfft2(search, s=size)
     products = fft.irfft2(spectrum.sum(axis=1), s=size)[:, :rows, :columns]
 
-    sums = _box_sums(search, templates.shape[2:])
-    squares = _box_sums(search * search, templates.shape[2:])
-    search_energy = (squares - sums * sums / pixels).sum(axis=1)
+    # One sum of squares does for all channels; the means are each channel's own.
+    squares = np.einsum("nchw,nchw->nhw", search, search)
+    search_energy = _box_sums(squares, templates.shape[2:])
+    for channel in range(search.shape[1]):
+        sums = _box_sums(search[:, channel], templates.shape[2:])
+        search_energy -= np.square(sums, out=sums) / pixels
     template_energy = np.square(template, dtype=np.float64).sum(axis=(1, 2, 3))[:, None, None]
 
-    flat_search = _FLAT * np.square(search, dtype=np.float64).mean(axis=(2, 3)).sum(axis=1)[:, None, None] * pixels
+    flat_search = _FLAT * squares.mean(axis=(1, 2), dtype=np.float64)[:, None, None] * pixels
     flat_template = _FLAT * np.square(templates, dtype=np.float64).sum(axis=(1, 2, 3))[:, None, None]
     textured = (search_energy > flat_search) & (template_energy > flat_template)
     norm = np.sqrt(np.where(textured, search_energy * template_energy, 1.0))
@@ -86,17 +90,15 @@ def _ncc_of_batch(templates: FloatArray, searches: FloatArray) -> Float32Array:
 
 
 def _box_sums(images: FloatArray, box: tuple[int, ...]) -> NDArray[np.float64]:
-    """Sum of the pixels under a box at every place where it fits, from the integral image."""
-    integral = np.zeros((*images.shape[:-2], images.shape[-2] + 1, images.shape[-1] + 1))
-    np.cumsum(images, axis=-2, out=integral[..., 1:, 1:], dtype=np.float64)
-    np.cumsum(integral[..., 1:, 1:], axis=-1, out=integral[..., 1:, 1:])
+    """Sum of the pixels under a box at every place where it fits, (N, rows, columns), from the integral image."""
     height, width = box
-    return (
-        integral[..., height:, width:]
-        - integral[..., :-height, width:]
-        - integral[..., height:, :-width]
-        + integral[..., :-height, :-width]
-    )
+    sums = np.empty((len(images), images.shape[1] - height + 1, images.shape[2] - width + 1))
+    for image, result in zip(images, sums, strict=True):
+        integral = cv2.integral(image, sdepth=cv2.CV_64F)
+        np.subtract(integral[height:, width:], integral[:-height, width:], out=result)
+        result -= integral[height:, :-width]
+        result += integral[:-height, :-width]
+    return sums
 
 
 def subpixel_peaks(surfaces: FloatArray) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

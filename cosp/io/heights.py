@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 
 from cosp.arrays import Float32Array, FloatArray
@@ -26,6 +26,7 @@ _GRIDS = {
 _SYSTEM_FOLDERS = (Path("/usr/share/proj"), Path("/usr/local/share/proj"))
 _log = logging.getLogger(__name__)
 _NODE_M = 2000.0
+_DEGREE_M = 111_200.0
 
 
 def ellipsoidal_heights(path: str | Path, grid: PixelGrid, crs: str, heights: HeightSystem) -> Float32Array:
@@ -59,7 +60,8 @@ def undulation(grid: PixelGrid, crs: str, heights: HeightSystem) -> Float32Array
     """
     if heights == "ellipsoidal":
         return np.zeros(grid.shape, np.float32)
-    factor = max(1, math.floor(_NODE_M / abs(grid.step_x))) if abs(grid.step_x) > 1e-2 else 1
+    step_m = abs(grid.step_x) * (_DEGREE_M if CRS.from_user_input(crs).is_geographic else 1.0)
+    factor = max(1, math.floor(_NODE_M / step_m))
     rows = np.arange(-(-grid.shape[0] // factor) + 1)
     columns = np.arange(-(-grid.shape[1] // factor) + 1)
     nodes = grid.points(rows[:, None] * factor, columns[None, :] * factor)

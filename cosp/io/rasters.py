@@ -93,7 +93,8 @@ def read(path: str | Path, band: int | None = 1, window: Window | None = None) -
                 None if band is None else band, window=None if window is None else _rasterio_window(window)
             )
         except RasterioIOError as error:
-            raise InputError(f"{path}: the pixels cannot be read, the file may be truncated ({error})") from error
+            reason = error.__cause__ or error
+            raise InputError(f"{path}: the pixels cannot be read, the file may be truncated ({reason})") from error
     return values
 
 

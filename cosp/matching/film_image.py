@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ from cosp.imaging.windows import Window
 # Columns of a film taken at once when it is reduced: whole rows of a 7 um film stay below 64 MB.
 _READ_COLUMNS = 8192
 _REACH_PX = 3
+# Pieces of a buffered film: a few tens of megabytes at 7 um.
+_PIECE_COLUMNS = 1024
+_KEPT_PIECES = 6
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,25 @@ class FilmImage:
         ]
         return FilmImage.from_array(np.concatenate(parts, axis=1), self.grid.coarsened(factor))
 
+    def buffered(self) -> FilmImage:
+        """The same film, read by pieces along it of which the last few are kept, for many small windows in turn."""
+        rows, columns = self.grid.shape
+        read = self.read
+
+        @lru_cache(_KEPT_PIECES)
+        def piece(number: int) -> NDArray[Any]:
+            first = number * _PIECE_COLUMNS
+            return read(Window(0, rows, first, min(first + _PIECE_COLUMNS, columns)))
+
+        def read_buffered(window: Window) -> NDArray[Any]:
+            numbers = range(window.column0 // _PIECE_COLUMNS, (window.column1 - 1) // _PIECE_COLUMNS + 1)
+            first = numbers.start * _PIECE_COLUMNS
+            chosen = slice(window.column0 - first, window.column1 - first)
+            pieces = [piece(number)[window.row0 : window.row1] for number in numbers]
+            return (pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=1))[:, chosen]
+
+        return FilmImage(self.grid, read_buffered)
+
     def part(self, low_x_mm: float, high_x_mm: float) -> FilmImage:
         """The film between two places along it, as far as it reaches; at least one column."""
         columns = self.grid.shape[1]
@@ -78,6 +101,8 @@ class FilmImage:
         ).grown(_REACH_PX, shape)  # fmt: skip
         pixels = np.asarray(self.read(window))
         local_rows, local_columns = rows - window.row0, columns - window.column0
-        present = sample((pixels > 0).astype(np.uint8), local_rows, local_columns, interpolation="nearest")
         values = sample(pixels.astype(np.float32), local_rows, local_columns, interpolation="cubic")
-        return np.where(inside & (present > 0), values, np.float32(np.nan)).astype(np.float32)
+        if not pixels.all():
+            inside &= sample((pixels > 0).astype(np.uint8), local_rows, local_columns, interpolation="nearest") > 0
+        values[~inside] = np.nan
+        return np.asarray(values, np.float32)

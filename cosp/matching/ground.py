@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
@@ -17,6 +17,7 @@ from cosp.camera.mapping import MapProjector
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import NoOverlapError
 from cosp.geometry.grids import PixelGrid
+from cosp.geometry.lattices import smooth_on_grid
 from cosp.geometry.mapping import utm_crs
 from cosp.imaging.resampling import sample
 from cosp.matching.film_image import FilmImage
@@ -35,6 +36,8 @@ _HEIGHT_RANGE_M = (0.0, 6000.0)
 _TERRAIN_POSTING_M = 200.0
 # Candidates along either side of a map tile.
 _TILE_SIDE = 2
+# Largest side of a grid that counts as a tile: film coordinates are then smooth to far below a pixel.
+_TILE_M = 20_000.0
 
 
 @dataclass(frozen=True)
@@ -198,8 +201,31 @@ def tile_about(easting: float, northing: float, posting_m: float, size_px: int) 
 
 def project_film(film: FilmImage, projector: MapProjector, grid: PixelGrid, heights_m: FloatArray) -> Float32Array:
     """The film on a map grid, (rows, columns); NaN where it shows nothing or the height is not known."""
+    return film.sample(film_coordinates(projector, grid, heights_m))
+
+
+def film_coordinates(projector: MapProjector, grid: PixelGrid, heights_m: FloatArray) -> FloatArray:
+    """Film points (rows, columns, 2) in mm of every pixel of a map grid; NaN where the height is not known.
+
+    Over a tile they are a polynomial of low degree in easting, northing and height, to 1e-5 mm; a grid larger than a
+    tile, or one that leaves the sweep of the camera, is projected pixel by pixel.
+    """
+    known = np.isfinite(heights_m)
+    if known.any() and max(grid.shape) * abs(grid.step_x) <= _TILE_M:
+        low, high = float(heights_m[known].min()), float(heights_m[known].max())
+        middle, half = (low + high) / 2, max((high - low) / 2, 1.0)
+        levels = middle + half * np.array([-1.0, 0.0, 1.0])
+
+        def terms(xy: FloatArray) -> FloatArray:
+            below, at, above = (projector.film(xy[..., 0], xy[..., 1], level) for level in levels)
+            return np.concatenate([at, (above - below) / 2, (above + below) / 2 - at], axis=-1)
+
+        planes = smooth_on_grid(terms, grid)
+        if np.isfinite(planes).all():
+            height = (np.asarray(heights_m, float) - middle) / half
+            return np.stack([planes[i] + height * (planes[i + 2] + height * planes[i + 4]) for i in (0, 1)], axis=-1)
     centres = grid.centres()
-    return film.sample(projector.film(centres[..., 0], centres[..., 1], heights_m))
+    return projector.film(centres[..., 0], centres[..., 1], heights_m)
 
 
 def lattice_rc(shape: tuple[int, int], step_px: int, margin_px: int) -> FloatArray:
@@ -272,11 +298,18 @@ def match_film_to_ground(
 def in_threads(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> list[Result]:
     """Results of a function for each item, in their order, with progress in the log."""
     results: list[Result] = []
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for result in pool.map(work, items):
+
+    def gather(found: Iterable[Result]) -> None:
+        for result in found:
             results.append(result)
             if len(results) % 100 == 0:
                 log.info("%d/%d tiles", len(results), len(items))
+
+    if threads <= 1:
+        gather(map(work, items))
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            gather(pool.map(work, items))
     return results
 
 

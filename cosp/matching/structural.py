@@ -58,12 +58,19 @@ def orientation_channels(image: FloatArray, *, bins: int, sigma_px: float) -> Fl
     length = np.where(inside, np.hypot(gradient_x, gradient_y), 0.0).astype(np.float32)
 
     place = np.mod(np.arctan2(gradient_y, gradient_x), np.pi) * np.float32(bins / np.pi)
-    raw = np.empty((bins, *image.shape), np.float32)
-    for index in range(bins):
-        distance = np.abs(place - index)
-        raw[index] = length * np.maximum(0.0, 1.0 - np.minimum(distance, bins - distance))
-        raw[index] = cv2.GaussianBlur(raw[index], (0, 0), sigma_px)
-    channels = 0.25 * np.roll(raw, 1, axis=0) + 0.5 * raw + 0.25 * np.roll(raw, -1, axis=0)
+    lower = np.floor(place)
+    share = length * (place - lower)
+    index = lower.astype(np.intp)[None] % bins
+    raw = np.zeros((bins, *image.shape), np.float32)
+    np.put_along_axis(raw, index, (length - share)[None], axis=0)
+    np.put_along_axis(raw, (index + 1) % bins, share[None], axis=0)
+    for channel in raw:
+        cv2.GaussianBlur(channel, (0, 0), sigma_px, dst=channel)
+    channels = 0.5 * raw
+    raw *= 0.25
+    for step in (1, -1):
+        for number in range(bins):
+            channels[number] += raw[(number + step) % bins]
     norm = np.sqrt(np.einsum("kij,kij->ij", channels, channels))
     typical = float(np.median(norm[inside])) if inside.any() else 0.0
     channels /= norm + _FLAT_SHARE * typical + 1e-6

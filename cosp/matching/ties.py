@@ -18,6 +18,7 @@ from cosp.matching.filtering import consistent_by_tile
 from cosp.matching.ground import (
     OnGrid,
     Terrain,
+    film_coordinates,
     film_lattice,
     film_points_at,
     ground_pixel_m,
@@ -40,6 +41,8 @@ _DEGREE_X, _DEGREE_Y = 4, 1
 _MIN_FOR_OFFSET = 40
 # Candidates along either side of a map tile.
 _TILE_SIDE = 3
+# However high the score: terrain that the DEM does not hold shows differently in two films taken 30 degrees apart.
+_LEAST_SIGMA_PX = 0.3
 
 
 @dataclass(frozen=True)
@@ -119,13 +122,14 @@ def match_films(
     margin_px = template_px // 2 + search_px
     tile_px = template_px + 2 * search_px + (_TILE_SIDE - 1) * step_px + 4
 
+    area = grown(terrain.grid.bounds, 0.6 * tile_px * _COARSE * pixel_m)
+    projectors = [MapProjector(camera, crs, area) for camera in (fore_camera, aft_camera)]
+
     def pass_at(posting_m: float, offset: Callable[[FloatArray], FloatArray], count: int) -> FilmMatches:
         points_mm = _tile_points(fore_camera, max(1, count // _TILE_SIDE**2))
         factors = [reduction_for(posting_m, ground_pixel_m(c, f.pixel_mm, terrain.mean_m)) for c, f in
                    ((fore_camera, fore), (aft_camera, aft))]  # fmt: skip
-        films = [film.reduced(n) if n > 1 else film for film, n in zip((fore, aft), factors, strict=True)]
-        area = grown(terrain.grid.bounds, 0.6 * tile_px * posting_m)
-        projectors = [MapProjector(camera, crs, area) for camera in (fore_camera, aft_camera)]
+        films = [film.reduced(n) if n > 1 else film.buffered() for film, n in zip((fore, aft), factors, strict=True)]
         places = terrain.map_points(fore_camera, points_mm)
         places = places[np.isfinite(places).all(axis=1)]
         inside = (places[:, 0] > shared[0]) & (places[:, 0] < shared[2]) & (places[:, 1] > shared[1])
@@ -134,9 +138,7 @@ def match_films(
         def work(place: FloatArray) -> list[FloatArray]:
             grid = tile_about(place[0], place[1], posting_m, tile_px)
             heights = heights_on(grid)
-            centres = grid.centres()
-            fore_mm = projectors[0].film(centres[..., 0], centres[..., 1], heights)
-            aft_mm = projectors[1].film(centres[..., 0], centres[..., 1], heights)
+            fore_mm, aft_mm = (film_coordinates(projector, grid, heights) for projector in projectors)
             # The offset changes so slowly that one value does for a tile.
             middle = projectors[1].film(place[None, 0], place[None, 1], place[None, 2])
             moved = offset(middle)
@@ -149,7 +151,8 @@ def match_films(
             fore_points = film_points_at(projectors[0], grid, heights, found.moving_rc)
             aft_points = film_points_at(projectors[1], grid, heights, found.fixed_rc)
             predicted = film_points_at(projectors[1], grid, heights, found.moving_rc)
-            rows = np.column_stack([fore_points, aft_points + moved, predicted, found.score, found.sigma_px])
+            sigma_px = np.maximum(found.sigma_px, _LEAST_SIGMA_PX)
+            rows = np.column_stack([fore_points, aft_points + moved, predicted, found.score, sigma_px])
             return [rows[np.isfinite(rows).all(axis=1)]]
 
         table = np.concatenate([np.empty((0, 8)), *sum(in_threads(work, list(places), threads), [])])

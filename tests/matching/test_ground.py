@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
+from cosp.camera.mapping import MapProjector
 from cosp.errors import NoOverlapError
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.rays import meet
@@ -9,6 +10,7 @@ from cosp.matching.film_image import FilmImage
 from cosp.matching.ground import (
     Terrain,
     control_tiles,
+    film_coordinates,
     film_lattice,
     ground_pixel_m,
     grown,
@@ -128,8 +130,40 @@ def test_tie_points_are_the_same_ground_in_both_films(world):
     _, gap_m = meet(cameras[0].rays(ties.fore_mm), cameras[1].rays(ties.aft_mm))
     pixel_m = ground_pixel_m(cameras[0], films[0].pixel_mm, 1000.0)
     assert len(ties) > 200
+    assert ties.sigma_px.min() >= 0.3
     assert np.median(np.abs(gap_m)) < 0.2 * pixel_m
     assert np.abs(gap_m).max() < 1.5 * pixel_m
+
+
+@pytest.mark.parametrize("posting", [2.0, 15.0, 85.0])
+def test_film_coordinates_of_a_tile_are_those_of_its_pixels(camera, posting):
+    east, north = (float(v) for v in Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(10.2, 46.1))
+    grid = tile_about(east, north, posting, 131)
+    rows, columns = np.mgrid[0:131, 0:131]
+    heights = (1500 + 700 * np.sin(rows / 9) * np.cos(columns / 13)).astype(np.float32)
+    heights[40:50, 60:70] = np.nan
+    projector = MapProjector(camera, CRS, grid.bounds)
+    centres = grid.centres()
+    exact = projector.film(centres[..., 0], centres[..., 1], heights)
+    found = film_coordinates(projector, grid, heights)
+    # 7e-5 mm is a hundredth of a pixel of 7 um; what is left are the seams of the map's own lattice.
+    np.testing.assert_allclose(found, exact, atol=max(7e-5, posting * 2e-6))
+    assert np.isnan(found[45, 65]).all()
+
+
+def test_a_buffered_film_shows_the_same_and_reads_each_piece_once():
+    pixels = np.random.default_rng(0).integers(1, 255, (40, 3000)).astype(np.uint8)
+    film, windows = film_of(pixels), []
+
+    def read(window):
+        windows.append(window)
+        return film.read(window)
+
+    buffered = FilmImage(film.grid, read).buffered()
+    for x in (80.0, 90.0, 92.2, 100.0):
+        points = np.array([[x, 3.0], [x + 2.0, 2.0]])
+        np.testing.assert_array_equal(buffered.sample(points), film.sample(points))
+    assert len(windows) == 2
 
 
 def test_film_lattice_runs_along_the_film():
