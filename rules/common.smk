@@ -112,6 +112,14 @@ def members_of_block_pairs(wildcards):
     ]
 
 
+def members_of_site_pairs(wildcards):
+    """Fore scene, aft scene and block of every pair of a site."""
+    return [
+        [project.pairs[pair].fore, project.pairs[pair].aft, project.block_of(pair)]
+        for pair in project.pairs_of_site(wildcards.site)
+    ]
+
+
 def of_block(pattern):
     """Function that gives a file of every scene of a block."""
     return lambda wildcards: expand(pattern, scene=scenes_of_block(wildcards))

@@ -104,6 +104,8 @@ rule mosaic_site:
         gcp_summaries=of_scenes_of_site("results/scenes/{scene}/gcps.json"),
         seams=of_scenes_of_site("results/scenes/{scene}/seams.json"),
         adjustments=of_blocks_of_site("results/blocks/{block}/adjustment.json"),
+        cameras=of_blocks_of_site("results/blocks/{block}/cameras"),
+        area_of_interest=site_file("area_of_interest"),
         residual_figures=of_blocks_of_site("results/blocks/{block}/residuals.png"),
         reference_dem=of_site("reference_dem"),
         unstable_terrain=site_file("unstable_terrain"),
@@ -126,7 +128,7 @@ rule mosaic_site:
         "../envs/cosp.yaml"
     threads: 1
     resources:
-        mem_mb=memory(6),
+        mem_mb=3000,
         runtime=60,
     params:
         **choices("mosaic_site"),
@@ -135,6 +137,7 @@ rule mosaic_site:
         pairs=lambda wildcards: project.pairs_of_site(wildcards.site),
         scenes=lambda wildcards: project.scenes_of_site(wildcards.site),
         blocks=lambda wildcards: project.blocks_of_site(wildcards.site),
+        members=members_of_site_pairs,
         reference_dem_heights=of_site("reference_dem_heights"),
     message:
         "Joining the pairs of {wildcards.site}"

@@ -2,21 +2,34 @@
 
 import io
 import logging
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 
-from cosp.dem.blending import mosaic, mosaic_orthophotos
-from cosp.dem.differencing import difference_statistics
+from cosp.camera.mapping import MapProjector
+from cosp.camera.panoramic import PanoramicCamera
+from cosp.dem.assessment import seen_by
+from cosp.dem.blending import grey_levels, mosaic, mosaic_orthophotos
+from cosp.dem.tally import Tally
 from cosp.dem.terrain import slope_deg, stable_terrain
-from cosp.imaging.windows import Window
+from cosp.geometry.grids import PixelGrid
+from cosp.imaging.windows import Window, tiles
 from cosp.io import rasters, records, tables, vectors
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
 from cosp.report import figures
 from cosp.report.film import Bending, draw_bending, draw_control, draw_y_parallax
 from cosp.report.page import Picture, Section, Table, build_page, comparison, flat, picture, readable
-from cosp.report.site import common_grid, library_versions, summary_sentence
+from cosp.report.site import (
+    common_grid,
+    draw_tally,
+    facts_table,
+    library_versions,
+    pair_table,
+    statistics_table,
+    summary_sentence,
+)
 
 
 def mosaic_site(
@@ -32,8 +45,10 @@ def mosaic_site(
     seam_paths,
     adjustment_paths,
     residual_figure_paths,
+    camera_folders,
     reference_dem_path,
     unstable_path,
+    area_path,
     dem_path,
     difference_path,
     ortho_path,
@@ -45,82 +60,100 @@ def mosaic_site(
     pairs,
     scenes,
     blocks,
+    members,
     reference_dem_heights,
     blend_m,
     slope_limit_deg,
-    strip_rows,
+    tile_cells,
 ):
     log = logging.getLogger("mosaic_site")
     infos = [rasters.info(path) for path in dem_paths]
     crs = infos[0].crs
     grid = common_grid([info.grid for info in infos])
-    halo = int(np.ceil(blend_m / grid.step_x)) + 1
+    projectors = projectors_of_pairs(members, dict(zip(blocks, camera_folders, strict=True)), crs, grid.bounds)
+    film_bounds = {
+        scene: (-film["half_length_mm"], -film["half_width_mm"], film["half_length_mm"], film["half_width_mm"])
+        for scene, film in zip(scenes, map(records.read_json, film_paths), strict=True)
+    }
 
-    def strip(path, info, rows, missing):
-        """Rows of a raster on the common grid."""
-        part = np.full((rows[1] - rows[0], grid.shape[1]), missing)
-        row0, column0 = (int(round(float(v))) for v in grid.pixels((info.grid.x0, info.grid.y0)))
-        first, last = max(rows[0], row0), min(rows[1], row0 + info.shape[0])
-        if first < last:
-            window = Window(first - row0, last - row0, 0, info.shape[1])
-            values = rasters.read(path, window=window)
-            part[first - rows[0] : last - rows[0], column0 : column0 + info.shape[1]] = values
-        return part
+    def ground_asked(reference_m, window):
+        """Cells that both films of a pair see, inside the area of interest."""
+        here = grid.window(window.row0, window.row1, window.column0, window.column1)
+        asked = np.zeros(here.shape, bool)
+        for pair in projectors:
+            sides = [seen_by(project.film, reference_m, here, film_bounds[scene]) for scene, project in pair.items()]
+            asked |= np.logical_and.reduce(sides)
+        return asked & vectors.rasterise(area_path, here, crs) if area_path else asked
 
-    tags = {"content": "heights above the WGS 84 ellipsoid", "unit": "metre"}
+    kept = Thinned(grid)
+    tallies = {"all": Tally(), "stable": Tally()}
     options = {"shape": grid.shape, "dtype": "float32", "grid": grid, "crs": crs, "cog": True}
-    slopes = np.empty(grid.shape, np.float32)
-    difference_m = np.empty(grid.shape, np.float32)
-    heights_m = np.empty(grid.shape, np.float32)
-    with rasters.create(dem_path, **options, descriptions=["height_m"], tags=tags) as dem:
-        for row in range(0, grid.shape[0], strip_rows):
-            inner = row, min(row + strip_rows, grid.shape[0])
-            outer = max(row - halo, 0), min(inner[1] + halo, grid.shape[0])
-            models = [strip(p, i, outer, np.float32(np.nan)) for p, i in zip(dem_paths, infos, strict=True)]
-            joined = mosaic(models, ramp_cells=blend_m / grid.step_x)
-            reference_m = ellipsoidal_heights(
-                reference_dem_path, grid.window(*outer, 0, grid.shape[1]), crs, reference_dem_heights
-            )
-            slope = slope_deg(reference_m, grid.step_x, grid.step_y)
-            kept = slice(inner[0] - outer[0], inner[1] - outer[0])
-            heights_m[inner[0] : inner[1]] = joined[kept]
-            difference_m[inner[0] : inner[1]] = (joined - reference_m)[kept]
-            slopes[inner[0] : inner[1]] = slope[kept]
-            dem.write(Window(*inner, 0, grid.shape[1]), joined[kept])
-            log.info("joined %d/%d rows", inner[1], grid.shape[0])
-    tags = {"content": "site DEM minus reference DEM", "unit": "metre"}
-    with rasters.create(difference_path, **options, descriptions=["height_difference_m"], tags=tags) as difference:
-        difference.write(None, difference_m)
+    heights_said = {"content": "heights above the WGS 84 ellipsoid", "unit": "metre"}
+    difference_said = {"content": "site DEM minus reference DEM", "unit": "metre"}
+    halo = int(np.ceil(blend_m / grid.step_x)) + 1
+    with (
+        rasters.create(dem_path, **options, descriptions=["height_m"], tags=heights_said) as dem,
+        rasters.create(
+            difference_path, **options, descriptions=["height_difference_m"], tags=difference_said
+        ) as difference,
+    ):
+        windows = tiles(grid.shape, tile_cells)
+        for done, window in enumerate(windows, 1):
+            outer = window.grown(halo, grid.shape)
+            models = pieces(dem_paths, infos, grid, outer, np.float32(np.nan))
+            heights_m = np.full(window.shape, np.nan, np.float32)
+            difference_m = heights_m
+            if models:
+                here = grid.window(outer.row0, outer.row1, outer.column0, outer.column1)
+                inner = window.inside(outer).slices
+                reference_m = ellipsoidal_heights(reference_dem_path, here, crs, reference_dem_heights)
+                unstable = vectors.rasterise(unstable_path, here, crs) if unstable_path else None
+                slope = slope_deg(reference_m, here.step_x, here.step_y)
+                stable = stable_terrain(slope, unstable, slope_limit_deg=slope_limit_deg)
+                heights_m = mosaic(list(models.values()), ramp_cells=blend_m / grid.step_x)[inner]
+                difference_m = heights_m - reference_m[inner]
+                asked = ground_asked(reference_m[inner], window)
+                tallies["all"].add(difference_m, asked & np.isfinite(slope[inner]))
+                tallies["stable"].add(difference_m, asked & stable[inner])
+            dem.write(window, heights_m)
+            difference.write(window, difference_m)
+            kept.take(window, heights_m=heights_m, difference_m=difference_m)
+            log.info("joined %d/%d tiles", done, len(windows))
 
     ortho_infos = [rasters.info(path) for path in ortho_paths]
     ortho_grid = common_grid([info.grid for info in ortho_infos])
-    images = []
-    for path, info in zip(ortho_paths, ortho_infos, strict=True):
-        image = np.zeros(ortho_grid.shape, np.uint8)
-        row, column = (int(round(float(v))) for v in ortho_grid.pixels((info.grid.x0, info.grid.y0)))
-        image[row : row + info.shape[0], column : column + info.shape[1]] = rasters.read(path)
-        images.append(image)
-    joined = mosaic_orthophotos(images, ramp_cells=blend_m / ortho_grid.step_x)
-    rasters.write(ortho_path, joined, grid=ortho_grid, crs=crs, nodata=0, cog=True)
+    ramp_cells = blend_m / ortho_grid.step_x
+    thin = Thinned(ortho_grid)
+    for window in tiles(ortho_grid.shape, tile_cells):
+        for path, piece in pieces(ortho_paths, ortho_infos, ortho_grid, window, np.uint8(0)).items():
+            thin.take(window, **{path: piece})
+    greys = [np.nan_to_num(thin.arrays[path]).astype(np.uint8) for path in ortho_paths]
+    levels = dict(zip(ortho_paths, grey_levels(greys, ramp_cells=ramp_cells / thin.every), strict=True))
+    options = {"shape": ortho_grid.shape, "dtype": "uint8", "grid": ortho_grid, "crs": crs, "nodata": 0, "cog": True}
+    with rasters.create(ortho_path, **options) as ortho:
+        for window in tiles(ortho_grid.shape, tile_cells):
+            outer = window.grown(int(np.ceil(ramp_cells)) + 1, ortho_grid.shape)
+            images = pieces(ortho_paths, ortho_infos, ortho_grid, outer, np.uint8(0))
+            joined = np.zeros(outer.shape, np.uint8)
+            if images:
+                chosen = [levels[path] for path in images]
+                joined = mosaic_orthophotos(list(images.values()), ramp_cells=ramp_cells, levels=chosen)
+            ortho.write(window, joined[window.inside(outer).slices])
+    log.info("joined %d orthophotos", len(ortho_paths))
 
-    unstable = vectors.rasterise(unstable_path, grid, crs) if unstable_path else None
-    stable = stable_terrain(slopes, unstable, slope_limit_deg=slope_limit_deg)
     qualities = dict(zip(pairs, map(records.read_json, quality_paths), strict=True))
-    whole = {
-        "all": difference_statistics(difference_m, np.isfinite(slopes), cell_area_m2=grid.step_x**2),
-        "stable": difference_statistics(difference_m, stable, cell_area_m2=grid.step_x**2),
-    }
+    whole = {name: tally.statistics(cell_area_m2=grid.step_x**2) for name, tally in tallies.items()}
     quality = {"kind": "site_quality", "version": 1, "site": site, "crs": crs, "mosaic": whole, "pairs": qualities}
 
     films = dict(zip(scenes, map(records.read_json, film_paths), strict=True))
     adjustments = dict(zip(blocks, map(records.read_json, adjustment_paths), strict=True))
-    maps = [draw(figures.hillshade, heights_m, grid, title=f"{site}: heights")]
-    maps += [draw(figures.difference_map, difference_m, grid, title=f"{site}: DEM minus reference DEM")]
-    stable_difference = np.where(stable, difference_m, np.nan)
-    maps += [draw(figures.histogram, {"stable terrain": stable_difference}, title=f"{site}: differences")]
-    pictures = [
-        Picture(Path(path).read_bytes(), f"{Path(path).parent.name}: {Path(path).stem}") for path in figure_paths
-    ]
+    maps = (
+        draw(figures.hillshade, kept.arrays["heights_m"], kept.grid, title=f"{site}: heights"),
+        draw(figures.difference_map, kept.arrays["difference_m"], kept.grid, title=f"{site}: DEM minus reference DEM"),
+        picture(draw_tally(tallies["stable"], title=f"{site}: differences on stable terrain"), "distribution"),
+    )
+    pictures = {pair: [path for path in figure_paths if Path(path).parent.name == pair] for pair in pairs}
+    coregistrations = named(pairs, coregistration_paths)
     y_parallaxes = dict(zip(pairs, map(rasters.read, y_parallax_paths), strict=True))
     points = {}
     for scene, path in zip(scenes, gcp_paths, strict=True):
@@ -128,15 +161,29 @@ def mosaic_site(
         points[scene] = {role: gcps.loc[gcps["role"] == role, ["x_mm", "y_mm"]] for role in gcps["role"].unique()}
     half_width_mm = max(film["half_width_mm"] for film in films.values())
     sections = [
-        Section("Site", pictures=tuple(maps), tables=(comparison("Mosaic minus reference DEM", {site: whole}),)),
         Section(
-            "Pairs",
-            "Differences are ours minus reference, before and after coregistration, on stable terrain both films see.",
-            pictures=tuple(pictures),
+            "Site",
+            pictures=maps,
             tables=(
-                comparison("Quality of each pair", qualities),
-                comparison("Coregistration", named(pairs, coregistration_paths)),
+                facts_table(quality, settings),
+                statistics_table(
+                    "Mosaic minus reference DEM, ground that both films of a pair see",
+                    {"all terrain": whole["all"], "stable terrain": whole["stable"]},
+                ),
             ),
+        ),
+        *(
+            Section(
+                f"Pair {pair}",
+                "Differences are ours minus the other model's, before and after coregistration.",
+                pictures=tuple(Picture(Path(path).read_bytes(), caption_of(path)) for path in pictures[pair]),
+                tables=(pair_table(qualities[pair]),),
+                details=(
+                    comparison("Everything in its quality.json", {pair: qualities[pair]}),
+                    comparison("Coregistration", {pair: coregistrations[pair]}),
+                ),
+            )
+            for pair in pairs
         ),
         Section("Epipolar geometry", pictures=(picture(draw_y_parallax(y_parallaxes), "y-parallax that is left"),)),
         Section(
@@ -150,19 +197,17 @@ def mosaic_site(
         Section(
             "Ground control",
             pictures=(picture(draw_control(points, half_width_mm=half_width_mm), "where control lies on the films"),),
-            tables=(comparison("Control of each scene", named(scenes, gcp_summary_paths)),),
+            details=(comparison("Control of each scene", named(scenes, gcp_summary_paths)),),
         ),
         Section(
             "Films",
             pictures=(picture(draw_bending([bending(*film) for film in films.items()]), "bending that was taken out"),),
-            tables=(
-                comparison("Films", films),
-                seam_table(named(scenes, seam_paths)),
-            ),
+            tables=(seam_table(named(scenes, seam_paths)),),
+            details=(comparison("Everything in film.json", films),),
         ),
         Section(
             "Parameters and versions",
-            tables=(
+            details=(
                 Table("Parameters", ("key", "value"), tuple((k, readable(v)) for k, v in flat(settings))),
                 Table("Versions", ("package", "version"), tuple(library_versions().items())),
             ),
@@ -175,6 +220,73 @@ def mosaic_site(
 def named(names, paths):
     """Records by name."""
     return dict(zip(names, map(records.read_json, paths), strict=True))
+
+
+def projectors_of_pairs(members, camera_folders, crs, bounds):
+    """By scene, the map projector of both cameras of each pair."""
+    return [
+        {
+            scene: MapProjector(records.read(f"{camera_folders[block]}/{scene}.json", PanoramicCamera), crs, bounds)
+            for scene in (fore, aft)
+        }
+        for fore, aft, block in members
+    ]
+
+
+def pieces(paths, infos, grid, window, missing):
+    """By path, a window of the common grid of each raster that has anything there."""
+    found = {}
+    for path, info in zip(paths, infos, strict=True):
+        row, column = (round(float(v)) for v in grid.pixels((info.grid.x0, info.grid.y0)))
+        whole = Window(row, row + info.shape[0], column, column + info.shape[1])
+        part = Window(
+            max(window.row0, whole.row0),
+            min(window.row1, whole.row1),
+            max(window.column0, whole.column0),
+            min(window.column1, whole.column1),
+        )
+        if part.row0 < part.row1 and part.column0 < part.column1:
+            values = rasters.read(path, window=part.inside(whole))
+            if (np.isfinite(values) if np.isnan(missing) else values != missing).any():
+                piece = np.full(window.shape, missing)
+                piece[part.inside(window).slices] = values
+                found[path] = piece
+    return found
+
+
+class Thinned:
+    """Every n-th cell of arrays that come tile by tile, as many as a picture has pixels."""
+
+    def __init__(self, grid, longest=1600):
+        self.every = max(1, -(-max(grid.shape) // longest))
+        self.shape = grid.shape
+        first = self.every // 2
+        rows, columns = (len(range(first, n, self.every)) for n in grid.shape)
+        step_x, step_y = grid.step_x * self.every, grid.step_y * self.every
+        x0, y0 = (float(v) for v in grid.points(first, first))
+        self.grid = PixelGrid(x0, y0, step_x, step_y, (rows, columns))
+        self.arrays = defaultdict(lambda: np.full(self.grid.shape, np.nan, np.float32))
+
+    def take(self, window, **values):
+        """Keep what falls on every n-th row and column."""
+        first = self.every // 2
+        rows = np.arange(window.row0, window.row1)
+        columns = np.arange(window.column0, window.column1)
+        rows, columns = (v[v % self.every == first] for v in (rows, columns))
+        if rows.size and columns.size:
+            to = np.ix_((rows - first) // self.every, (columns - first) // self.every)
+            for name, array in values.items():
+                self.arrays[name][to] = array[np.ix_(rows - window.row0, columns - window.column0)]
+
+
+def caption_of(path):
+    """What a figure of a pair shows."""
+    shown = {
+        "hillshade": "shaded relief of the DEM after coregistration",
+        "dem_difference": "DEM after coregistration minus reference DEM; red is lower than the reference, blue higher",
+        "histogram": "distribution of the differences before and after coregistration",
+    }
+    return shown.get(Path(path).stem, Path(path).stem)
 
 
 def draw(function, *values, title):
@@ -219,6 +331,8 @@ if __name__ == "__main__":
             seam_paths=list(snakemake.input.seams),
             adjustment_paths=list(snakemake.input.adjustments),
             residual_figure_paths=list(snakemake.input.residual_figures),
+            camera_folders=list(snakemake.input.cameras),
+            area_path=snakemake.input.area_of_interest or None,
             reference_dem_path=snakemake.input.reference_dem,
             unstable_path=snakemake.input.unstable_terrain or None,
             dem_path=snakemake.output.dem,
@@ -231,8 +345,9 @@ if __name__ == "__main__":
             pairs=snakemake.params.pairs,
             scenes=snakemake.params.scenes,
             blocks=snakemake.params.blocks,
+            members=snakemake.params.members,
             reference_dem_heights=snakemake.params.reference_dem_heights,
             blend_m=snakemake.params.blend_m,
             slope_limit_deg=snakemake.params.slope_limit_deg,
-            strip_rows=snakemake.params.strip_rows,
+            tile_cells=snakemake.params.tile_cells,
         )

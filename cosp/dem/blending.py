@@ -61,27 +61,48 @@ def mosaic(models: Sequence[FloatArray], *, ramp_cells: float) -> Float32Array:
         return np.where(total > 0, base + weighted / total, np.nan).astype(np.float32)
 
 
-def mosaic_orthophotos(images: Sequence[ByteArray], *, ramp_cells: float) -> ByteArray:
-    """Orthophotos on one grid joined like `mosaic`; 0 is no data.
+def grey_levels(images: Sequence[ByteArray], *, ramp_cells: float) -> list[tuple[float, float]]:
+    """Gain and offset that bring each orthophoto to the contrast of those before it, where they overlap.
 
-    Each image is first brought to the contrast of those before it, where they overlap.
+    Thinned images on one grid serve as well as whole ones; 0 is no data.
     """
     levelled: list[FloatArray] = []
+    levels = []
     for image in images:
         grey = np.where(image > 0, image, np.nan).astype(np.float32)
-        if levelled:
-            grey = _level(grey, mosaic(levelled, ramp_cells=ramp_cells))
-        levelled.append(grey)
+        gain, offset = _level(grey, mosaic(levelled, ramp_cells=ramp_cells)) if levelled else (1.0, 0.0)
+        levels.append((gain, offset))
+        levelled.append(gain * grey + offset)
+    return levels
+
+
+def mosaic_orthophotos(
+    images: Sequence[ByteArray], *, ramp_cells: float, levels: Sequence[tuple[float, float]] | None = None
+) -> ByteArray:
+    """Orthophotos on one grid joined like `mosaic`; 0 is no data.
+
+    Parameters
+    ----------
+    images : uint8 arrays of one shape
+    ramp_cells : float
+    levels : (gain, offset) of each image, optional
+        From `grey_levels`; found from these images unless given, as it must be for tiles of a larger mosaic.
+    """
+    levels = grey_levels(images, ramp_cells=ramp_cells) if levels is None else levels
+    levelled = [
+        np.where(image > 0, gain * image.astype(np.float32) + offset, np.nan)
+        for image, (gain, offset) in zip(images, levels, strict=True)
+    ]
     joined = mosaic(levelled, ramp_cells=ramp_cells)
     return np.where(np.isfinite(joined), np.clip(np.rint(joined), 1, 255), 0).astype(np.uint8)
 
 
-def _level(image: Float32Array, target: Float32Array, least_cells: int = 100) -> Float32Array:
-    """The image with the median and spread of the target where both have values."""
+def _level(image: Float32Array, target: Float32Array, least_cells: int = 100) -> tuple[float, float]:
+    """Gain and offset that give the image the median and spread of the target where both have values."""
     both = np.isfinite(image) & np.isfinite(target)
     if both.sum() < least_cells:
-        return image
+        return 1.0, 0.0
     low, middle, high = np.percentile(image[both], [16, 50, 84])
     target_low, target_middle, target_high = np.percentile(target[both], [16, 50, 84])
-    gain = (target_high - target_low) / (high - low) if high > low else 1.0
-    return np.asarray(target_middle + gain * (image - middle), np.float32)
+    gain = float((target_high - target_low) / (high - low)) if high > low else 1.0
+    return gain, float(target_middle - gain * middle)

@@ -19,6 +19,9 @@ from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 
 
+_LEAST_SCALE_MM = 0.005
+
+
 @dataclass(frozen=True)
 class Bending:
     """Displacement across the film, as two curves along it, linear between them.
@@ -176,7 +179,9 @@ def _smooth(trace: Trace, x_mm: FloatArray, smoothing_mm: float) -> tuple[FloatA
     for _ in range(4):
         spline = make_smoothing_spline(x - centre, y, w=np.maximum(weights, 1e-3), lam=lam)
         residual = y - spline(x - centre)
-        scale = max(nmad(residual), 1e-6)
+        # Traces come without gross errors, and a good one is far closer to the film than a stiff curve can follow:
+        # what the curve misses must not be taken for an error of the trace.
+        scale = max(nmad(residual), _LEAST_SCALE_MM)
         weights = tukey_weights(residual / scale)
     # Places within half a wavelength share one value of the curve.
     independent = max(1.0, smoothing_mm / 2 / spacing * trace.share)

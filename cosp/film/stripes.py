@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
-from cosp.film.exposure import Exposure, without_lines
+from cosp.film.exposure import LINE_MM, Exposure, without_lines
 from cosp.geometry.robust import running_median, tukey_weights
 from cosp.geometry.statistics import nmad
 from cosp.imaging.resampling import sample
@@ -189,7 +189,10 @@ def trace_edge(
     inward = band if side == "top" else band[::-1]
     y_inward = y_mm if side == "top" else y_mm[::-1]
     pixel = float(abs(y_mm[1] - y_mm[0]))
-    smooth = gaussian_filter1d(without_lines(np.ascontiguousarray(inward), pixel), 0.7, axis=0)
+    # A strongly bent edge leaves little picture in the band; repeated inwards, it is not taken for a thin line.
+    padding = round(2 * LINE_MM / pixel)
+    whole = np.pad(inward, ((0, padding), (0, 0)), mode="edge")
+    smooth = gaussian_filter1d(without_lines(whole, pixel)[: len(inward)], 0.7, axis=0)
     step = np.diff(smooth, axis=0)
     # Steps of the picture's own texture are as large as its edge: the first large one from outside counts.
     strength = step.max(axis=0)
@@ -261,8 +264,10 @@ def _best_path(gain: Float32Array, reach: int) -> np.ndarray[tuple[int], np.dtyp
 
 
 def _path_mean(gain: Float32Array, reach: int) -> float:
-    path = _best_path(np.clip(gain, -3.0, 12.0), reach)
-    return float(gain[path, np.arange(gain.shape[1])].mean())
+    """Mean gain along the best path; limited, or a row of bright holes would outweigh a line seen everywhere."""
+    limited = np.clip(gain, -3.0, 12.0)
+    path = _best_path(limited, reach)
+    return float(limited[path, np.arange(gain.shape[1])].mean())
 
 
 def _refined(ridge: Float32Array, path: np.ndarray[tuple[int], np.dtype[np.int64]]) -> FloatArray:

@@ -20,7 +20,9 @@ caption { text-align: left; font-weight: 600; padding-bottom: 0.3rem; }
 th, td { padding: 0.15rem 0.7rem; border-bottom: 1px solid #e4e4e4; text-align: left; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; }
 figure { margin: 1rem 0; } figure img { max-width: 100%; } figcaption { color: #555; font-size: 13px; }
-nav a { margin-right: 1rem; } .key { font-size: 1.1rem; }
+td, th { overflow-wrap: anywhere; } details { margin: 0.6rem 0; } summary { cursor: pointer; color: #245; }
+details caption { display: none; } .scroll { overflow-x: auto; }
+nav a { margin-right: 1rem; display: inline-block; } .key { font-size: 1.1rem; }
 """
 
 
@@ -43,12 +45,13 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading of the page with what stands below it."""
+    """A heading of the page with what stands below it; `details` are tables that stay folded until asked for."""
 
     heading: str
     text: str = ""
     pictures: tuple[Picture, ...] = ()
     tables: tuple[Table, ...] = ()
+    details: tuple[Table, ...] = ()
 
 
 def picture(figure: Figure, caption: str, *, dpi: int = 110) -> Picture:
@@ -112,6 +115,8 @@ def _section(number: int, section: Section) -> str:
         parts.append(f"<p>{html.escape(section.text)}</p>")
     parts += [_picture(each) for each in section.pictures]
     parts += [_table(each) for each in section.tables]
+    for each in section.details:
+        parts.append(f"<details><summary>{html.escape(each.caption)}</summary>{_table(each)}</details>")
     return "\n".join(parts)
 
 
@@ -126,7 +131,8 @@ def _picture(each: Picture) -> str:
 def _table(table: Table) -> str:
     head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
     rows = "\n".join("<tr>" + "".join(_cell(value) for value in row) + "</tr>" for row in table.rows)
-    return f"<table><caption>{html.escape(table.caption)}</caption>\n<tr>{head}</tr>\n{rows}\n</table>"
+    caption = html.escape(table.caption)
+    return f'<div class="scroll"><table><caption>{caption}</caption>\n<tr>{head}</tr>\n{rows}\n</table></div>'
 
 
 def _cell(value: Any) -> str:

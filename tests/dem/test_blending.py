@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.testing import assert_allclose
 
-from cosp.dem.blending import edge_weights, mosaic, mosaic_orthophotos
+from cosp.dem.blending import edge_weights, grey_levels, mosaic, mosaic_orthophotos
 
 
 def two_models(height_a=1000.0, height_b=1010.0):
@@ -62,3 +62,18 @@ def test_orthophotos_join_without_a_step_in_brightness():
     assert joined.dtype == np.uint8
     assert np.abs(joined.astype(float) - ground).max() < 6
     assert mosaic_orthophotos([np.zeros((5, 5), np.uint8)], ramp_cells=3).max() == 0
+
+
+def test_tiles_with_halo_and_common_levels_give_the_whole_mosaic_of_orthophotos():
+    rng = np.random.default_rng(5)
+    ground = np.clip(rng.normal(120, 25, (80, 200)), 20, 230)
+    a, b = ground.astype(np.uint8), (0.6 * ground + 60).astype(np.uint8)
+    a[:, 130:] = 0
+    b[:, :70] = 0
+    levels = grey_levels([a, b], ramp_cells=20)
+    whole = mosaic_orthophotos([a, b], ramp_cells=20, levels=levels)
+    halo = 21
+    for start in range(0, 200, 50):
+        low, high = max(start - halo, 0), min(start + 50 + halo, 200)
+        tile = mosaic_orthophotos([a[:, low:high], b[:, low:high]], ramp_cells=20, levels=levels)
+        assert_allclose(tile[:, start - low : start - low + 50], whole[:, start : start + 50], atol=1)

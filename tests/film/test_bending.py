@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from cosp import sheets
 from cosp.film.bending import (
     Bending,
     bending_from_traces,
@@ -14,7 +15,7 @@ from cosp.film.bending import (
     no_bending,
     straighten,
 )
-from cosp.film.exposure import Exposure
+from cosp.film.exposure import LINE_MM, Exposure
 from cosp.film.rail_holes import find_rail_holes
 from cosp.film.stripes import Trace, band_profiles, band_window, smooth_base, trace_edge, trace_ridge
 from cosp.imaging.windows import Window, tiles
@@ -221,3 +222,52 @@ def test_rail_holes_are_found_to_a_third_of_a_pixel(film):
     assert np.sqrt(np.mean(offset**2)) < 0.3 * step
     truth = WIDTH_MM / 2 + 4.6 + bend_mm(holes[:, 0], 1)
     assert np.sqrt(np.mean((holes[:, 1] - truth) ** 2)) < 0.3 * step
+
+
+def test_an_edge_bent_nearly_out_of_the_band_is_still_traced_where_it_is():
+    pixel_mm = 0.05
+    y_mm = np.arange(1.2, -1.25, -pixel_mm)
+    edge_mm = -0.1 - 0.98 * np.sin(np.linspace(0.0, np.pi, len(X_MM)))
+    band = np.where(y_mm[:, None] < edge_mm, 120.0, 20.0).astype(np.float32)
+    trace = trace_edge(band, y_mm, X_MM, side="top", min_step=6.0, outlier_mm=0.08)
+    assert edge_mm.min() - y_mm[-1] < 0.2, "less picture in the band than a line is thick"
+    assert trace.share > 0.99
+    assert np.nanmax(np.abs(trace.y_mm - edge_mm)) < 0.8 * pixel_mm
+
+
+def test_stripes_are_looked_for_from_where_lines_begin_and_edges_as_far_as_films_bend():
+    defaults = sheets.fill_defaults(sheets.schema("config"), {"sites": {}})["trace_stripes"]
+    assert defaults["stripe_reach_mm"][0] < LINE_MM, "stripes lie 0.6 mm and more beside the picture"
+    assert defaults["edge_reach_mm"][0] <= -1.2
+    assert defaults["edge_reach_mm"][1] >= 1.2
+
+
+def test_a_row_of_bright_rail_holes_does_not_draw_the_trace_from_a_faint_stripe():
+    pixel = 0.028
+    y = np.arange(6.5, 0.2, -pixel)
+    rng = np.random.default_rng(2)
+    band = rng.normal(26, 0.3, (len(y), len(X_MM)))
+    stripe = 0.72 + 0.03 * np.sin(X_MM / 40)
+    band += 15 * np.exp(-0.5 * ((y[:, None] - stripe) / 0.05) ** 2)
+    holes = (np.abs(y[:, None] - 2.1) < 0.3) & (np.abs(X_MM % 10 - 5) < 0.6)
+    band[holes] = 250
+    band[y < 0.3] = 120  # the picture itself, where its edge was not followed well
+    trace = trace_ridge(
+        band.astype(np.float32), y, X_MM, side="top", slope_mm=0.02, min_contrast=4.0, outlier_mm=0.05
+    )  # fmt: skip
+    assert trace.share > 0.95
+    assert np.nanmax(np.abs(trace.y_mm - stripe)) < 0.2 * pixel
+
+
+def test_a_precise_trace_is_followed_where_the_film_waves():
+    """A curve that waves every 90 mm by half a millimetre, traced to a tenth of a micrometre."""
+    wave = 0.25 * np.sin(2 * np.pi * X_MM / 90) + 0.3 * np.sin(2 * np.pi * X_MM / 400)
+    noise = np.random.default_rng(3).normal(0, 1e-4, (2, len(X_MM)))
+    traces = [
+        Trace(side, X_MM, sign * 28.4 + wave + error, np.full(len(X_MM), 20.0))
+        for side, sign, error in (("top", 1, noise[0]), ("bottom", -1, noise[1]))
+    ]
+    found = bending_from_traces(*traces, source="stripes", step_mm=2.0, smoothing_mm=12.0, single_sd_mm=0.05)
+    bent = found.bent(np.stack([X_MM, np.zeros_like(X_MM)], axis=-1))[:, 1]
+    inside = np.abs(X_MM) < 365
+    assert np.abs(bent - wave)[inside].max() < 0.3 * 0.007  # of a pixel of 7 um

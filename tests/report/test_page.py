@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from cosp.dem.tally import Tally
 from cosp.geometry.grids import PixelGrid
 from cosp.report.film import Bending, draw_bending, draw_control, draw_y_parallax
 from cosp.report.page import Section, Table, build_page, comparison, flat, picture, readable
-from cosp.report.site import common_grid, library_versions
+from cosp.report.site import common_grid, draw_tally, library_versions, pair_table
 
 
 def _figure() -> Figure:
@@ -97,3 +98,27 @@ def test_versions_of_what_shapes_the_products_are_known() -> None:
     versions = library_versions()
     assert versions["numpy"] == np.__version__
     assert versions["snakemake"] != "not installed"
+
+
+def test_long_tables_stay_folded_until_asked_for() -> None:
+    page = build_page("Site", "fine", [Section("One", details=(Table("all of it", ("", "x"), (("a", 1),)),))])
+    assert "<details><summary>all of it</summary>" in page
+    assert page.count("<details>") == page.count("</details>") == 1
+
+
+def test_a_pairs_table_has_a_column_for_each_state_and_model() -> None:
+    said = {"before": {"median": 2.0}, "after": {"median": 0.1, "textured": {"median": 0.05}}}
+    table = pair_table({**said, "check": said})
+    assert len(table.columns) == 1 + 8
+    median = next(row for row in table.rows if row[0] == "median (m)")
+    assert median[1:5] == (2.0, None, 0.1, 0.05)
+
+
+def test_a_tallys_distribution_has_unit_area() -> None:
+    tally = Tally()
+    differences = np.random.default_rng(2).normal(0.4, 3.0, (300, 300))
+    tally.add(differences, np.ones(differences.shape, bool))
+    (panel,) = draw_tally(tally, title="differences").axes
+    values, edges, _ = panel.patches[0].get_data()
+    assert float(np.sum(values * np.diff(edges))) == pytest.approx(1.0, abs=0.01)
+    assert picture(draw_tally(Tally(), title="none"), "none").png.startswith(b"\x89PNG")
