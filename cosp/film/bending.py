@@ -18,7 +18,6 @@ from cosp.geometry.statistics import nmad
 from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 
-
 _LEAST_SCALE_MM = 0.005
 
 
