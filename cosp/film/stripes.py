@@ -155,20 +155,21 @@ def trace_ridge(
         All NaN where no line stands out.
     """
     pixel = float(abs(y_mm[1] - y_mm[0]))
-    best: tuple[float, Float32Array, float] | None = None
+    best: tuple[float, Float32Array, float, float] | None = None
     # The width of the line is not known: the scale at which it stands out most is taken.
     for width in _widths_px(pixel):
         ridge = _ridge(band, width)
         noise = max(nmad(ridge[ridge != 0]), 0.05)
         score = _path_mean(ridge / noise, max(1, round(slope_mm / pixel)))
         if best is None or score > best[0]:
-            best = (score, ridge, noise)
+            best = (score, ridge, noise, width)
     assert best is not None
-    _, ridge, noise = best
+    _, ridge, noise, width = best
     path = _best_path(np.clip(ridge / noise, -3.0, 12.0), max(1, round(slope_mm / pixel)))
     columns = np.arange(band.shape[1])
     strength = ridge[path, columns]
-    place = np.interp(_refined(ridge, path), np.arange(len(y_mm)), y_mm)
+    rows = _refined(ridge, path) if width < _NARROW_PX else _centroids(band, path, min(3.0 * width, _CLEAR_MM / pixel))
+    place = np.interp(rows, np.arange(len(y_mm)), y_mm)
     y = np.where(strength > min_contrast * noise, place, np.nan)
     return Trace(side, x_mm, _without_outliers(y, outlier_mm), strength)
 
@@ -228,6 +229,10 @@ def smooth_base(edge: Trace, *, straight_mm: float, min_share: float) -> FloatAr
     return np.interp(u, u[seen], trend)
 
 
+_CLEAR_MM = 0.45  # nothing else lies so close to a line
+_NARROW_PX = 4.0  # a line narrower than this has a top that a parabola fits
+
+
 def _widths_px(pixel_mm: float) -> list[float]:
     """Widths of a line to look for, px: from a pixel and a half, and 0.04 to 0.4 mm."""
     return sorted({max(1.5, width / pixel_mm) for width in (0.04, 0.08, 0.16, 0.32)})
@@ -282,6 +287,24 @@ def _refined(ridge: Float32Array, path: np.ndarray[tuple[int], np.dtype[np.int64
     with np.errstate(invalid="ignore", divide="ignore"):
         part = np.where(curve < 0, 0.5 * (a - c) / curve, 0.0)
     return np.asarray(inner + np.clip(part, -0.5, 0.5))
+
+
+def _centroids(band: Float32Array, path: np.ndarray[tuple[int], np.dtype[np.int64]], reach_px: float) -> FloatArray:
+    """Row of the middle of a line whose ridge has a flat top: the centroid of what stands above its sides."""
+    reach = int(np.ceil(reach_px))
+    columns = np.arange(len(path))
+    centre = path.astype(float)
+    for _ in range(5):
+        middle = np.clip(np.rint(centre).astype(np.int64), reach, band.shape[0] - 1 - reach)
+        rows = middle + np.arange(-reach, reach + 1)[:, None]
+        grey = band[rows, columns].astype(np.float64)
+        sides = np.maximum(grey[: reach // 3 + 1].mean(axis=0), grey[-(reach // 3 + 1) :].mean(axis=0))
+        # Half way up, grain beside the line has no say.
+        excess = np.maximum(grey - (sides + grey.max(axis=0)) / 2, 0.0)
+        total = excess.sum(axis=0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            centre = np.where(total > 0, (excess * rows).sum(axis=0) / total, path)
+    return centre
 
 
 def _without_outliers(y_mm: FloatArray, limit_mm: float) -> FloatArray:

@@ -271,3 +271,21 @@ def test_a_precise_trace_is_followed_where_the_film_waves():
     bent = found.bent(np.stack([X_MM, np.zeros_like(X_MM)], axis=-1))[:, 1]
     inside = np.abs(X_MM) < 365
     assert np.abs(bent - wave)[inside].max() < 0.3 * 0.007  # of a pixel of 7 um
+
+
+@pytest.mark.parametrize("pixel", [0.007, 0.014, 0.028, 0.056])
+def test_a_flat_and_a_sloping_stripe_are_placed_alike_at_every_digitisation(pixel):
+    y = np.arange(3.0, 0.2, -pixel)
+    rng = np.random.default_rng(4)
+    x = X_MM[:200]
+    stripe = 1.2 + 0.15 * np.sin(x / 25)  # level at its crests, steep between them
+    fine = y[:, None] + (np.arange(9) - 4) / 9 * pixel  # a pixel is the mean over its side
+    inside = np.abs(fine[:, :, None] - stripe) < 0.06
+    band = 26 + 160 * inside.mean(axis=1) + rng.normal(0, 1.5, (len(y), len(x)))
+    trace = trace_ridge(
+        band.astype(np.float32), y, x, side="top", slope_mm=0.02, min_contrast=4.0, outlier_mm=0.05
+    )  # fmt: skip
+    error = trace.y_mm - stripe
+    assert trace.share > 0.95
+    assert np.sqrt(np.nanmean(error**2)) < max(0.1 * pixel, 0.0007)
+    assert abs(np.nanmean(error[np.abs(np.cos(x / 25)) < 0.3])) < 0.1 * pixel  # no bias where it is level
