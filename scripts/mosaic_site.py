@@ -213,7 +213,7 @@ def mosaic_site(
             ),
         ),
     ]
-    write_text(page_path, build_page(f"Quality of site {site}", summary_sentence(quality), sections))
+    records.write_text(page_path, build_page(f"Quality of site {site}", summary_sentence(quality), sections))
     records.write(quality_path, quality)
 
 
@@ -307,13 +307,6 @@ def seam_table(by_scene):
     shown = ("left", "right", "rotation_deg", "overlap_mm", "inliers", "rms_px", "check_rms_px")
     rows = tuple((scene, *(seam.get(k) for k in shown)) for scene, each in by_scene.items() for seam in each["seams"])
     return Table("Seams", ("scene", *shown), rows)
-
-
-def write_text(path, text):
-    """Write a text whole or not at all."""
-    temporary = Path(path).with_name(f".{Path(path).name}.part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
 
 
 if __name__ == "__main__":

@@ -50,10 +50,25 @@ def triangulate(
     y_parallax = np.nan_to_num(rasters.read(y_parallax_path, band=SMOOTH_BAND))
     y_parallax_grid = rasters.info(y_parallax_path).grid
 
+    def bounds(window):
+        """Disparities of the lowest and the highest ground expected, from nodes between which they hardly curve."""
+        nodes = [
+            np.linspace(a, b - 1, n)
+            for (a, b, n) in ((window.row0, window.row1, 9), (window.column0, window.column1, 17))
+        ]
+        ends = rectification.disparity_bounds(nodes[0][:, None], nodes[1][None, :])
+        at = np.meshgrid(
+            *(np.linspace(0, len(n) - 1, size) for n, size in zip(nodes, window.shape, strict=True)), indexing="ij"
+        )
+        return [upsample_grid(end.astype(np.float32), *at) for end in ends]
+
     def intersect(window, more_px=0.0):
         rows = np.arange(window.row0, window.row1)[:, None]
         columns = np.arange(window.column0, window.column1)[None, :]
-        disparity = rasters.read(disparity_path, window=window) + more_px
+        disparity = rasters.read(disparity_path, window=window)
+        low, high = bounds(window)
+        disparity[(disparity < low) | (disparity > high)] = np.nan
+        disparity += more_px
         smooth = upsample_grid(y_parallax, *y_parallax_grid.pixels(disparity_info.grid.points(rows, columns)))
         fore_mm, aft_mm = rectification.conjugate_points(rows, columns, disparity, smooth)
         return intersect_tabulated(*tables, fore_mm, aft_mm)

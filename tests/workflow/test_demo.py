@@ -83,5 +83,5 @@ def test_the_quality_page_holds_everything_itself(site: Path) -> None:
     page = (site / "results" / "sites" / "small" / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") >= 8
     assert 'src="http' not in page
-    for heading in ("Site", "Pairs", "Epipolar geometry", "Orientation", "Ground control", "Films", "Parameters"):
+    for heading in ("Site", f"Pair {PAIR}", "Epipolar geometry", "Orientation", "Ground control", "Films", "Parameters"):
         assert heading in page
