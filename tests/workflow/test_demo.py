@@ -83,5 +83,6 @@ def test_the_quality_page_holds_everything_itself(site: Path) -> None:
     page = (site / "results" / "sites" / "small" / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") >= 8
     assert 'src="http' not in page
-    for heading in ("Site", f"Pair {PAIR}", "Epipolar geometry", "Orientation", "Ground control", "Films", "Parameters"):
+    headings = ("Site", f"Pair {PAIR}", "Epipolar geometry", "Orientation", "Ground control", "Films", "Parameters")
+    for heading in headings:
         assert heading in page
