@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from cosp.arrays import Float32Array
 from cosp.errors import InputError
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
+from cosp.io.temporary import temporary_for
 
 FILM_CRS = 'LOCAL_CS["film, millimetres from the centre of format",UNIT["millimetre",0.001]]'
 PIXEL_CRS = 'LOCAL_CS["pixels",UNIT["pixel",1]]'
@@ -152,8 +152,7 @@ def create(
     RasterWriter
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    temporary = temporary_for(path)
     floating = np.issubdtype(np.dtype(dtype), np.floating)
     if nodata is None and floating:
         nodata = float("nan")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import geopandas as gpd
@@ -15,6 +14,7 @@ from cosp.arrays import BoolArray
 from cosp.errors import InputError
 from cosp.geometry.grids import PixelGrid
 from cosp.io.rasters import _transform_of
+from cosp.io.temporary import temporary_for
 
 _GEOPACKAGE_DATE = "2000-01-01T00:00:00.000Z"  # a GeoPackage says when it was changed; products must not
 
@@ -39,8 +39,7 @@ def read(path: str | Path, crs: str) -> gpd.GeoDataFrame:
 def write(path: str | Path, features: gpd.GeoDataFrame, layer: str) -> None:
     """Write a GeoPackage, whole or not at all; the same features give the same bytes."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    temporary = temporary_for(path)
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _GEOPACKAGE_DATE})
     try:
         features.to_file(temporary, driver="GPKG", layer=layer, engine="pyogrio")

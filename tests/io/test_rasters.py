@@ -1,5 +1,8 @@
 """Rasters: half pixels, windows, reference systems, whole files or none."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import rasterio
@@ -88,3 +91,13 @@ def test_missing_wrong_and_truncated_files_are_named(tmp_path):
     (tmp_path / "cut.tif").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"cut\.tif"):
         rasters.read(tmp_path / "cut.tif")
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path):
+    finished = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    left = tmp_path / f".h.{finished.stdout.strip()}.part.tif"
+    left.write_text("half a raster")
+    other = tmp_path / f".other.{finished.stdout.strip()}.part.tif"
+    other.write_text("of another file")
+    rasters.write(tmp_path / "h.tif", heights(), grid=MAP, crs="EPSG:32632")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [other.name, "h.tif"]
