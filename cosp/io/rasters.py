@@ -23,6 +23,7 @@ from rasterio.windows import Window as RasterioWindow
 from cosp.arrays import Float32Array
 from cosp.errors import InputError
 from cosp.geometry.grids import PixelGrid
+from cosp.imaging.resampling import block_mean
 from cosp.imaging.windows import Window
 from cosp.io.temporary import temporary_for
 
@@ -103,8 +104,6 @@ def read_reduced(path: str | Path, factor: int, band: int = 1) -> NDArray[Any]:
 
     The result's grid is `info(path).grid.coarsened(factor)`; ragged edges repeat outwards.
     """
-    from cosp.imaging.resampling import block_mean
-
     rows, columns = info(path).shape
     height = max(factor, 2048 // factor * factor)
     parts = [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import types
 import typing
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cosp.errors import InputError
+from cosp.io.temporary import temporary_for
 
 RecordT = TypeVar("RecordT")
 
@@ -29,8 +29,7 @@ def write(path: str | Path, record: Any) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file in UTF-8, whole or not at all."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = temporary_for(path)
     temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pandas as pd
 
 from cosp.errors import InputError
+from cosp.io.temporary import temporary_for
 
 
 def read(path: str | Path) -> pd.DataFrame:
@@ -27,7 +27,6 @@ def read(path: str | Path) -> pd.DataFrame:
 def write(path: str | Path, table: pd.DataFrame) -> None:
     """Write a table, whole or not at all."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = temporary_for(path)
     table.reset_index(drop=True).to_parquet(temporary, index=False)
     temporary.replace(path)
