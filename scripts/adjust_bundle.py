@@ -13,6 +13,7 @@ from cosp.geometry.frames import LocalFrame
 from cosp.imaging.resampling import sample
 from cosp.io import heights, rasters, records, tables, vectors
 from cosp.io.logs import log_to
+from cosp.report import figures
 from cosp.report.residuals import FilmResiduals, draw_residuals
 
 
@@ -105,7 +106,7 @@ def adjust_bundle(
     )
     tables.write(residuals_path, table)
     figure = draw_residuals([film_residuals(camera, table, grid_step_mm, grid_radius_mm) for camera in adjusted])
-    figure.savefig(figure_path, dpi=120)
+    figures.save(figure, figure_path, dpi=120)
     records.write(summary_path, summary)
 
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from cosp.arrays import BoolArray, FloatArray
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.statistics import nmad
+from cosp.io.temporary import temporary_for
 
 _LONGEST_PX = 1600
 
@@ -71,7 +72,7 @@ def histogram(
     axes.set(xlabel="elevation difference (m)", ylabel="density (1/m)", title=title)
     axes.set_ylim(top=1.25 * axes.get_ylim()[1])  # room for the legend
     axes.legend(fontsize="small", loc="upper right")
-    _save(figure, target)
+    save(figure, target)
 
 
 def _reduced(values: FloatArray, grid: PixelGrid) -> tuple[FloatArray, tuple[float, ...], tuple[float, float]]:
@@ -100,16 +101,15 @@ def _map_axes(shape: tuple[int, ...]) -> tuple[Figure, Any]:
 def _finish(figure: Figure, axes: Any, title: str, target: str | Path | BinaryIO) -> None:
     axes.set(title=title, xlabel="easting (km)", ylabel="northing (km)")
     axes.ticklabel_format(useOffset=False, style="plain")
-    _save(figure, target)
+    save(figure, target)
 
 
-def _save(figure: Figure, target: str | Path | BinaryIO) -> None:
+def save(figure: Figure, target: str | Path | BinaryIO, dpi: int = 150) -> None:
     """Into an open file, or into a file by name, whole or not at all."""
     if not isinstance(target, (str, Path)):
-        figure.savefig(target, dpi=150, format="png")
+        figure.savefig(target, dpi=dpi, format="png")
         return
     path = Path(target)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
-    figure.savefig(temporary, dpi=150)
+    temporary = temporary_for(path)
+    figure.savefig(temporary, dpi=dpi)
     temporary.replace(path)
