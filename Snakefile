@@ -31,5 +31,6 @@ rule all:
         collect(
             "results/pairs/{pair}/{product}",
             pair=project.pairs,
-            product=["dem_sigma.tif", "ortho.tif", "quality.json"],
+            product=["dem_sigma.tif", "quality.json", *orthophotos()],
         ),
+        collect("results/blocks/{block}/exports", block=blocks_to_export()),

@@ -509,7 +509,7 @@ def check_sites(settings: Mapping[str, Any], file: str, folder: Path) -> list[Fa
     """Faults of the sites: files that are not there, coordinate systems that cannot carry a DEM."""
     faults = []
     for site, options in settings["sites"].items():
-        for key in ("reference_dem", "reference_image", "unstable_terrain", "area_of_interest", "check_dem"):
+        for key in ("reference_dem", "reference_image", "unstable_terrain", "gcps", "area_of_interest", "check_dem"):
             path = options.get(key)
             if path is None or is_simulated(settings, site, path) or (folder / path).is_file():
                 continue
@@ -529,6 +529,26 @@ def check_sites(settings: Mapping[str, Any], file: str, folder: Path) -> list[Fa
             if not usable:
                 wanted = "auto, or a projected coordinate system in metres such as EPSG:32647"
                 faults.append(Fault(file, repr(crs), wanted, column=f"sites.{site}.crs"))
+    return faults
+
+
+def check_own_gcps(settings: Mapping[str, Any], scenes: Sequence[Scene], file: str, folder: Path) -> list[Fault]:
+    """Faults of the ground control points that people measured: what cannot be read, and what is of no scene."""
+    from cosp.io import gcps
+
+    faults = []
+    for site, options in settings["sites"].items():
+        if options["gcps"] is None or not (folder / options["gcps"]).is_file():
+            continue
+        key, ours = f"sites.{site}.gcps", {scene.scene for scene in scenes if scene.site == site}
+        try:
+            named = set(gcps.read(folder / options["gcps"])["scene"])
+        except InputError as error:
+            faults.append(Fault(file, str(error), "a table of ground control points (config/README.md)", column=key))
+            continue
+        if not named & ours:
+            found = f"points of {', '.join(sorted(named)[:3])}"
+            faults.append(Fault(file, found, f"points of scenes of this site: {', '.join(sorted(ours))}", column=key))
     return faults
 
 
@@ -562,6 +582,8 @@ def load(settings: Mapping[str, Any], *, file: str = "config", folder: Path | No
     rows, found = read_scenes(folder / scenes_file, scenes_file)
     sheet_is_whole = not found
     faults += found + check_scenes(rows, sites or {}, scenes_file)
+    if complete and sheet_is_whole:
+        faults += check_own_gcps(complete, rows, file, folder)
     scenes = {scene.scene: scene for scene in reversed(rows)}
     scenes = {scene.scene: scenes[scene.scene] for scene in rows}
 

@@ -181,8 +181,8 @@ def config_name(paths: Iterable[str | Path]) -> str:
 
 
 def any_of(names: Iterable[str]) -> str:
-    """Regular expression that fits just these names."""
-    return "|".join(sorted(map(re.escape, names)))
+    """Regular expression that fits just these names; nothing where there are none."""
+    return "|".join(sorted(map(re.escape, names))) or "(?!)"
 
 
 def scenes_of(project: Project, wildcards: Mapping[str, str] | Any) -> list[Scene]:
@@ -211,6 +211,12 @@ def largest_film_mpx(project: Project, wildcards: Mapping[str, str] | Any) -> fl
 
 def settings_for_page(project: Project, site: str) -> dict[str, Any]:
     """Sections of the config that shaped a site's products, for its quality page."""
-    general = ("scenes", "pairs", "sites", "simulate_site")
+    general = ("scenes", "pairs", "sites", "simulate_site", "export_cameras")
     sections = {key: value for key, value in project.settings.items() if key not in general}
     return {"site": project.settings["sites"][site], **sections}
+
+
+def blocks_to_export(project: Project) -> list[str]:
+    """Blocks whose cameras the config wants in the forms of other programs."""
+    wanted = bool(project.settings["export_cameras"]["formats"])
+    return sorted({project.block_of(pair) for pair in project.pairs}) if wanted else []

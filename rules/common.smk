@@ -17,6 +17,7 @@ wildcard_constraints:
     pair=house.any_of(project.pairs),
     block=house.any_of({scene.block for scene in project.scenes.values()}),
     look="fore|aft",
+    aft="|_aft",
 
 
 scattergather:
@@ -56,6 +57,16 @@ def site_file(key):
 def member(look):
     """Function that gives the scene of a pair by its look."""
     return lambda wildcards: getattr(project.pairs[wildcards.pair], look)
+
+
+def shown(wildcards):
+    """Scene of a pair that an orthophoto shows."""
+    return member("aft" if wildcards.aft else "fore")(wildcards)
+
+
+def orthophotos():
+    """Orthophotos that the config wants of every pair."""
+    return ["ortho.tif"] + ["ortho_aft.tif"] * project.settings["aft_orthophotos"]
 
 
 def film_of(look, name):
@@ -125,6 +136,18 @@ def of_block(pattern):
     return lambda wildcards: expand(pattern, scene=scenes_of_block(wildcards))
 
 
+def others_of_block(pattern):
+    """Function that gives a file of every other scene of a scene's block."""
+    return lambda wildcards: expand(
+        pattern,
+        scene=[
+            name
+            for name in project.scenes_of_block(scene_of(wildcards).block)
+            if name != wildcards.scene
+        ],
+    )
+
+
 def of_pairs_of_block(pattern):
     """Function that gives a file of every pair of a block."""
     return lambda wildcards: expand(pattern, pair=pairs_of_block(wildcards))
@@ -147,6 +170,11 @@ def of_blocks_of_site(pattern):
     return lambda wildcards: expand(
         pattern, block=project.blocks_of_site(wildcards.site)
     )
+
+
+def blocks_to_export():
+    """Blocks whose cameras the config wants in the forms of other programs."""
+    return house.blocks_to_export(project)
 
 
 def settings_for_page(wildcards):

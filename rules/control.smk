@@ -5,25 +5,63 @@ rule locate_coarsely:
         reference_dem=of_site("reference_dem"),
         reference_image=site_file("reference_image"),
     output:
-        footprint="results/scenes/{scene}/footprint.json",
+        placement="results/scenes/{scene}/placement.json",
+        figure=report(
+            "results/scenes/{scene}/placement.png",
+            caption="../docs/captions/placement.rst",
+            category="Control",
+            labels={"scene": "{scene}", "figure": "search for the film on the ground"},
+        ),
     log:
         "logs/locate_coarsely/{scene}.log",
     benchmark:
         "benchmarks/locate_coarsely/{scene}.jsonl"
     conda:
         "../envs/cosp.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=memory(2),
         runtime=30,
     params:
         **choices("locate_coarsely"),
         library=house.script_digest("locate_coarsely"),
+        day=of_scene("date"),
         reference_dem_heights=of_site("reference_dem_heights"),
     message:
         "Searching where {wildcards.scene} lies"
     script:
         "../scripts/locate_coarsely.py"
+
+
+rule place_frame:
+    input:
+        placement="results/scenes/{scene}/placement.json",
+        others=others_of_block("results/scenes/{scene}/placement.json"),
+        film="results/scenes/{scene}/film.tif",
+        camera="results/scenes/{scene}/camera_predicted.json",
+        reference_dem=of_site("reference_dem"),
+        reference_image=site_file("reference_image"),
+    output:
+        footprint="results/scenes/{scene}/footprint.json",
+    log:
+        "logs/place_frame/{scene}.log",
+    benchmark:
+        "benchmarks/place_frame/{scene}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 1
+    resources:
+        mem_mb=memory(2),
+        runtime=30,
+    params:
+        **choices("locate_coarsely"),
+        library=house.script_digest("place_frame"),
+        day=of_scene("date"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+    message:
+        "Settling where {wildcards.scene} lies"
+    script:
+        "../scripts/place_frame.py"
 
 
 rule match_tiles:
@@ -39,10 +77,18 @@ rule match_tiles:
     benchmark:
         "benchmarks/match_tiles/{scene}_{scatteritem}.jsonl"
     conda:
-        "../envs/cosp.yaml"
+        (
+            "../envs/learned-matching.yaml"
+            if choices("match_tiles")["matcher"] == "lightglue"
+            else "../envs/cosp.yaml"
+        )
     threads: 1
     resources:
-        mem_mb=memory(0.5),
+        mem_mb=(
+            memory(0.5)
+            if choices("match_tiles")["matcher"] in ("structural", "sift")
+            else 4000
+        ),
         runtime=runtime(2),
     params:
         **choices("match_tiles"),
@@ -62,7 +108,9 @@ rule collect_gcps:
         film="results/scenes/{scene}/film.tif",
         footprint="results/scenes/{scene}/footprint.json",
         reference_dem=of_site("reference_dem"),
+        reference_image=site_file("reference_image"),
         unstable_terrain=site_file("unstable_terrain"),
+        own_gcps=site_file("gcps"),
     output:
         gcps="results/scenes/{scene}/gcps.parquet",
         summary="results/scenes/{scene}/gcps.json",
@@ -95,6 +143,7 @@ rule match_pair:
         reference_dem=of_site("reference_dem"),
     output:
         tie_points="results/pairs/{pair}/tie_points.parquet",
+        summary="results/pairs/{pair}/tie_points.json",
     log:
         "logs/match_pair/{pair}.log",
     benchmark:

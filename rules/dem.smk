@@ -107,6 +107,7 @@ rule mosaic_site:
         cameras=of_blocks_of_site("results/blocks/{block}/cameras"),
         area_of_interest=site_file("area_of_interest"),
         residual_figures=of_blocks_of_site("results/blocks/{block}/residuals.png"),
+        placement_figures=of_scenes_of_site("results/scenes/{scene}/placement.png"),
         reference_dem=of_site("reference_dem"),
         unstable_terrain=site_file("unstable_terrain"),
     output:

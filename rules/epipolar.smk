@@ -1,8 +1,10 @@
 rule rectify:
     input:
         cameras=cameras_of_pair,
-        fore_summary=film_of("fore", "film.json"),
-        aft_summary=film_of("aft", "film.json"),
+        fore_film=film_of("fore", "film.tif"),
+        aft_film=film_of("aft", "film.tif"),
+        fore_footprint=film_of("fore", "footprint.json"),
+        aft_footprint=film_of("aft", "footprint.json"),
         reference_dem=of_site("reference_dem"),
         area_of_interest=site_file("area_of_interest"),
     output:
@@ -13,12 +15,13 @@ rule rectify:
         "benchmarks/rectify/{pair}.jsonl"
     conda:
         "../envs/cosp.yaml"
-    threads: 1
+    threads: 2
     resources:
-        mem_mb=2000,
-        runtime=10,
+        mem_mb=memory(1),
+        runtime=runtime(0.3),
     params:
         **choices("rectify"),
+        y_parallax=choices("measure_y_parallax"),
         library=house.script_digest("rectify"),
         fore=member("fore"),
         aft=member("aft"),
@@ -33,6 +36,8 @@ rule resample_epipolar:
     input:
         fore_film=film_of("fore", "film.tif"),
         aft_film=film_of("aft", "film.tif"),
+        fore_footprint=film_of("fore", "footprint.json"),
+        aft_footprint=film_of("aft", "footprint.json"),
         rectification="results/pairs/{pair}/rectification.json",
     output:
         fore="results/pairs/{pair}/fore_epipolar.tif",

@@ -2,15 +2,15 @@ rule stitch:
     input:
         parts=parts_of_scene,
     output:
-        stitched=temp("results/scenes/{scene}/stitched.tif"),
         seams="results/scenes/{scene}/seams.json",
+        figure="results/scenes/{scene}/seams.png",
     log:
         "logs/stitch/{scene}.log",
     benchmark:
         "benchmarks/stitch/{scene}.jsonl"
     conda:
         "../envs/cosp.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=memory(2),
         runtime=runtime(0.2),
@@ -27,7 +27,8 @@ rule stitch:
 
 rule trace_stripes:
     input:
-        stitched="results/scenes/{scene}/stitched.tif",
+        parts=parts_of_scene,
+        seams="results/scenes/{scene}/seams.json",
     output:
         exposure="results/scenes/{scene}/exposure.json",
         stripes="results/scenes/{scene}/stripes.parquet",
@@ -37,9 +38,9 @@ rule trace_stripes:
         "benchmarks/trace_stripes/{scene}.jsonl"
     conda:
         "../envs/cosp.yaml"
-    threads: 2
+    threads: 1
     resources:
-        mem_mb=memory(1),
+        mem_mb=memory(2),
         runtime=runtime(0.2),
     params:
         **choices("trace_stripes"),
@@ -54,20 +55,21 @@ rule trace_stripes:
 
 rule correct_bending:
     input:
-        stitched="results/scenes/{scene}/stitched.tif",
+        parts=parts_of_scene,
         seams="results/scenes/{scene}/seams.json",
         exposure="results/scenes/{scene}/exposure.json",
         stripes="results/scenes/{scene}/stripes.parquet",
     output:
         film="results/scenes/{scene}/film.tif",
         summary="results/scenes/{scene}/film.json",
+        figure="results/scenes/{scene}/bending.png",
     log:
         "logs/correct_bending/{scene}.log",
     benchmark:
         "benchmarks/correct_bending/{scene}.jsonl"
     conda:
         "../envs/cosp.yaml"
-    threads: 2
+    threads: 1
     resources:
         mem_mb=memory(3),
         runtime=runtime(0.3),

@@ -35,6 +35,8 @@ rule adjust_bundle:
         unstable_terrain=site_file("unstable_terrain"),
     output:
         cameras=directory("results/blocks/{block}/cameras"),
+        fields=directory("results/blocks/{block}/fields"),
+        height_sigma=directory("results/blocks/{block}/height_sigma"),
         summary="results/blocks/{block}/adjustment.json",
         residuals="results/blocks/{block}/residuals.parquet",
         figure=report(
@@ -42,6 +44,12 @@ rule adjust_bundle:
             caption="../docs/captions/residuals.rst",
             category="Orientation",
             labels={"block": "{block}", "figure": "residuals of the adjustment"},
+        ),
+        field_figure=report(
+            "results/blocks/{block}/film_fields.png",
+            caption="../docs/captions/film_fields.rst",
+            category="Orientation",
+            labels={"block": "{block}", "figure": "distortion of the films"},
         ),
     log:
         "logs/adjust_bundle/{block}.log",
@@ -59,7 +67,36 @@ rule adjust_bundle:
         library=house.script_digest("adjust_bundle"),
         scenes=scenes_of_block,
         pairs=members_of_block_pairs,
+        pair_names=pairs_of_block,
     message:
         "Adjusting the cameras of {wildcards.block}"
     script:
         "../scripts/adjust_bundle.py"
+
+
+rule export_cameras:
+    input:
+        cameras="results/blocks/{block}/cameras",
+        films=of_block("results/scenes/{scene}/film.tif"),
+        reference_dem=of_site("reference_dem"),
+    output:
+        exports=directory("results/blocks/{block}/exports"),
+    log:
+        "logs/export_cameras/{block}.log",
+    benchmark:
+        "benchmarks/export_cameras/{block}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=2000,
+        runtime=60,
+    params:
+        **choices("export_cameras"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+        library=house.script_digest("export_cameras"),
+        scenes=scenes_of_block,
+    message:
+        "Cameras of {wildcards.block} for other programs"
+    script:
+        "../scripts/export_cameras.py"

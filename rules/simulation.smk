@@ -14,6 +14,9 @@ rule simulate_site:
         "logs/simulate_site/{site}.log",
     benchmark:
         "benchmarks/simulate_site/{site}.jsonl"
+    # Files of a site that is not to be simulated are its user's own, wherever they lie.
+    wildcard_constraints:
+        site=house.any_of(choices("simulate_site")),
     conda:
         "../envs/cosp.yaml"
     threads: 2
@@ -44,6 +47,9 @@ rule expose_film:
         "logs/expose_film/{site}_{scene}.log",
     benchmark:
         "benchmarks/expose_film/{site}_{scene}.jsonl"
+    # Files of a site that is not to be simulated are its user's own, wherever they lie.
+    wildcard_constraints:
+        site=house.any_of(choices("simulate_site")),
     conda:
         "../envs/cosp.yaml"
     threads: 2

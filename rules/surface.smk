@@ -84,7 +84,10 @@ rule triangulate:
 rule grid_dem:
     input:
         points="results/pairs/{pair}/points.tif",
+        validity="results/pairs/{pair}/validity.tif",
         summary="results/pairs/{pair}/points.json",
+        cameras=cameras_of_pair,
+        height_sigma=block_file("height_sigma"),
     output:
         dem="results/pairs/{pair}/dem.tif",
         sigma="results/pairs/{pair}/dem_sigma.tif",
@@ -103,6 +106,8 @@ rule grid_dem:
         library=house.script_digest("grid_dem"),
         crs=crs_of_site,
         resolution_m=of_site("dem_resolution_m"),
+        pair=lambda wildcards: wildcards.pair,
+        fore=member("fore"),
     message:
         "Gridding the heights of {wildcards.pair}"
     script:
@@ -111,28 +116,29 @@ rule grid_dem:
 
 rule orthorectify:
     input:
-        film=film_of("fore", "film.tif"),
+        film=lambda wildcards: f"results/scenes/{shown(wildcards)}/film.tif",
+        footprint=lambda wildcards: f"results/scenes/{shown(wildcards)}/footprint.json",
         cameras=cameras_of_pair,
         reference_dem=of_site("reference_dem"),
         dem="results/pairs/{pair}/dem.tif",
     output:
-        ortho="results/pairs/{pair}/ortho.tif",
+        ortho="results/pairs/{pair}/ortho{aft}.tif",
     log:
-        "logs/orthorectify/{pair}.log",
+        "logs/orthorectify/{pair}{aft}.log",
     benchmark:
-        "benchmarks/orthorectify/{pair}.jsonl"
+        "benchmarks/orthorectify/{pair}{aft}.jsonl"
     conda:
         "../envs/cosp.yaml"
     threads: 2
     resources:
-        mem_mb=memory(2),
+        mem_mb=memory(1),
         runtime=runtime(0.3),
     params:
         **choices("orthorectify"),
         reference_dem_heights=of_site("reference_dem_heights"),
         library=house.script_digest("orthorectify"),
-        fore=member("fore"),
+        scene=shown,
     message:
-        "Orthorectifying the fore film of {wildcards.pair}"
+        "Orthorectifying {params.scene} of {wildcards.pair}"
     script:
         "../scripts/orthorectify.py"

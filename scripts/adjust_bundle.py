@@ -7,14 +7,20 @@ import pandas as pd
 from pyproj import Transformer
 
 from cosp.adjustment import blocks, precision
-from cosp.adjustment.observations import PLAIN_PRIORS, Control, Ties
+from cosp.adjustment.calibration import FieldChoices
+from cosp.adjustment.observations import Control, HeightReference, Ties
+from cosp.adjustment.posterior import height_sigma
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.frames import LocalFrame
+from cosp.geometry.grids import PixelGrid
 from cosp.imaging.resampling import sample
 from cosp.io import heights, rasters, records, tables, vectors
 from cosp.io.logs import log_to
 from cosp.report import figures
 from cosp.report.residuals import FilmResiduals, draw_residuals
+
+FIELD_GRID_MM = 5.0  # posting of the exported fields
+HEIGHT_SIGMA_MM = 10.0  # posting of the standard deviation of heights
 
 
 def adjust_bundle(
@@ -25,13 +31,24 @@ def adjust_bundle(
     reference_dem_path,
     unstable_path,
     cameras_folder,
+    fields_folder,
+    height_sigma_folder,
     summary_path,
     residuals_path,
     figure_path,
+    field_figure_path,
     *,
     scenes,
     pairs,
+    pair_names,
     reference_dem_heights,
+    model,
+    knots_along_mm,
+    knots_across_mm,
+    correlation_lengths_mm,
+    reference_sigma_m,
+    reference_sigma_horizontal_m,
+    max_slope_deg,
     film_distortion_um,
     tie_distortion_um,
     gate_sigma,
@@ -46,52 +63,75 @@ def adjust_bundle(
     origin = common_origin(placed)
     cameras = [camera.moved_to(origin) for camera in placed]
 
-    control = [
-        control_points(table[table.role == "control"], origin, pixel_mm, film_distortion_um / 1000.0)
-        for table, pixel_mm in zip(gcps, pixels_mm, strict=True)
-    ]
-    checks = [
-        control_points(table[table.role == "check"], origin, pixel_mm, film_distortion_um / 1000.0)
-        for table, pixel_mm in zip(gcps, pixels_mm, strict=True)
-    ]
+    control, checks = (
+        [
+            control_points(table[table.role == role], origin, pixel_mm)
+            for table, pixel_mm in zip(gcps, pixels_mm, strict=True)
+        ]
+        for role in ("control", "check")
+    )
     ties = [
-        tie_points(
-            table, scenes.index(fore), scenes.index(aft), pixels_mm[scenes.index(fore)], tie_distortion_um / 1000.0
-        )
+        tie_points(table, scenes.index(fore), scenes.index(aft), pixels_mm[scenes.index(fore)])
         for table, (fore, aft) in zip(tie_tables, pairs, strict=True)
     ]
-
-    block = blocks.orient_block(cameras, control, ties, priors=PLAIN_PRIORS, gate_sigma=gate_sigma)
-    adjusted = block.adjustment.cameras
-
-    held_out = []
-    for points, weights in zip(ties, block.adjustment.tie_weights, strict=True):
-        near = precision.in_held_out_blocks(
-            points.first_mm, control[points.first].film_mm, checks[points.first].film_mm
-        )
-        ground, _ = precision.intersect(adjusted, points)
-        held_out.append(origin.geodetic_from_local(ground[near & (weights > 0)]))
-    tie_lonlath = np.concatenate([np.empty((0, 3)), *held_out])
-    errors = blocks.check_errors(
-        adjusted,
-        checks,
-        tie_heights_m=tie_lonlath[:, 2],
-        reference_heights_m=reference_heights(reference_dem_path, reference_dem_heights, unstable_path, tie_lonlath),
-        gate_sigma=gate_sigma,
+    held_out = [
+        precision.in_held_out_blocks(points.first_mm, control[points.first].film_mm, checks[points.first].film_mm)
+        for points in ties
+    ]
+    reference = HeightReference(
+        reference_surface(reference_dem_path, reference_dem_heights, unstable_path, cameras),
+        sigma_m=reference_sigma_m,
+        sigma_horizontal_m=reference_sigma_horizontal_m,
+        largest_slope_deg=max_slope_deg,
     )
+    field = FieldChoices(knots_along_mm, knots_across_mm, tuple(correlation_lengths_mm)) if model == "field" else None
+    film_groups = [int(scene in {aft for _, aft in pairs}) for scene in scenes]
+    choices = {"field": field, "reference": reference, "gate_sigma": gate_sigma, "film_groups": film_groups}
+
+    block = blocks.orient_block(
+        cameras,
+        control,
+        ties,
+        film_distortion_mm=film_distortion_um / 1000.0,
+        tie_distortion_mm=tie_distortion_um / 1000.0,
+        held_out=held_out,
+        **choices,
+    )
+    errors, plain_errors = (
+        check_errors(adjustment, checks, ties, held_out, reference, gate_sigma)
+        for adjustment in (block.adjustment, block.plain)
+    )
+    final = blocks.with_checks(block, control, checks, ties, prior_cameras=cameras, **choices)
     summary = blocks.summary(
         block,
+        final,
         control,
         ties,
         checks,
         errors,
+        plain_errors,
         pixels_mm=pixels_mm,
-        priors=PLAIN_PRIORS,
+        film_distortion_mm=film_distortion_um / 1000.0,
+        tie_distortion_mm=tie_distortion_um / 1000.0,
         correlation_limit=correlation_limit,
     )
 
-    for camera in adjusted:
+    for camera in final.adjustment.cameras:
         records.write(Path(cameras_folder) / f"{camera.scene}.json", camera)
+        write_field(Path(fields_folder) / f"{camera.scene}.tif", camera)
+    for name, (fore, aft), points in zip(pair_names, pairs, ties, strict=True):
+        sigma = height_sigma(
+            final.adjustment.cameras,
+            scenes.index(fore),
+            scenes.index(aft),
+            covariance=final.adjustment.covariance,
+            calibration=final.calibration,
+            film_sigma_mm=0.0 if field else film_distortion_um / 1000.0,
+            height_m=mean_height_m(final.adjustment, points),
+            step_mm=HEIGHT_SIGMA_MM,
+        )
+        records.write(Path(height_sigma_folder) / f"{name}.json", sigma)
+    adjusted = block.adjustment.cameras
     table = pd.concat(
         [
             *(
@@ -107,6 +147,11 @@ def adjust_bundle(
     tables.write(residuals_path, table)
     figure = draw_residuals([film_residuals(camera, table, grid_step_mm, grid_radius_mm) for camera in adjusted])
     figures.save(figure, figure_path, dpi=120)
+    drawn = [
+        film_field(camera, points, pixel_mm)
+        for camera, points, pixel_mm in zip(final.adjustment.cameras, control, pixels_mm, strict=True)
+    ]
+    figures.save(draw_residuals(drawn, label="displacement, px"), field_figure_path, dpi=120)
     records.write(summary_path, summary)
 
 
@@ -120,46 +165,101 @@ def common_origin(cameras):
     return LocalFrame(float(centres[0]), float(centres[1]))
 
 
-def control_points(table, origin, pixel_mm, distortion_mm):
+def control_points(table, origin, pixel_mm):
     ground = origin.local_from_geodetic(table[["longitude_deg", "latitude_deg", "height_m"]].to_numpy())
     return Control(
         film_mm=table[["x_mm", "y_mm"]].to_numpy(),
         ground_m=ground,
-        sigma_mm=np.hypot(table.sigma_px.to_numpy() * pixel_mm, distortion_mm),
+        sigma_mm=table.sigma_px.to_numpy() * pixel_mm,
         sigma_ground_m=table.sigma_ground_m.to_numpy(),
         sigma_height_m=table.sigma_height_m.to_numpy(),
     )
 
 
-def tie_points(table, first, second, pixel_mm, distortion_mm):
+def tie_points(table, first, second, pixel_mm):
     return Ties(
         first=first,
         second=second,
         first_mm=table[["fore_x_mm", "fore_y_mm"]].to_numpy(),
         second_mm=table[["aft_x_mm", "aft_y_mm"]].to_numpy(),
-        sigma_mm=np.hypot(table.sigma_px.to_numpy() * pixel_mm, distortion_mm),
+        sigma_mm=table.sigma_px.to_numpy() * pixel_mm,
     )
 
 
-def reference_heights(dem_path, dem_heights, unstable_path, lonlath):
-    """Ellipsoidal heights of the reference at points; NaN outside it and on unstable terrain."""
-    if not len(lonlath):
-        return np.empty(0)
+def reference_surface(dem_path, dem_heights, unstable_path, cameras):
+    """Function that gives ellipsoidal heights of the reference about the films; NaN outside, on unstable terrain."""
+    lonlat = np.concatenate([camera.locate_geodetic(outline(camera), 0.0)[:, :2] for camera in cameras])
     info = rasters.info(dem_path)
     to_map = Transformer.from_crs("EPSG:4326", info.crs, always_xy=True)
-    east_north = np.stack(to_map.transform(lonlath[:, 0], lonlath[:, 1]), axis=-1)
-    rows, columns = info.grid.pixels(east_north)
-    row0, column0 = (max(0, int(np.floor(a.min())) - 2) for a in (rows, columns))
-    row1 = min(info.shape[0], int(np.ceil(rows.max())) + 3)
-    column1 = min(info.shape[1], int(np.ceil(columns.max())) + 3)
+    rows, columns = info.grid.pixels(np.stack(to_map.transform(lonlat[:, 0], lonlat[:, 1]), axis=-1))
+    ends = []
+    for places, size in ((rows, info.shape[0]), (columns, info.shape[1])):
+        margin = 0.1 * np.ptp(places) + 4.0
+        ends.append((max(0, int(places.min() - margin)), min(size, int(places.max() + margin))))
+    (row0, row1), (column0, column1) = ends
     if row0 >= row1 or column0 >= column1:
-        return np.full(len(lonlath), np.nan)
+        return lambda lonlat: np.full(len(lonlat), np.nan)
     grid = info.grid.window(row0, row1, column0, column1)
-    values = rasters.read_on_grid(dem_path, grid, info.crs)
+    values = heights.ellipsoidal_heights(dem_path, grid, info.crs, dem_heights)
     if unstable_path:
         values[vectors.rasterise(unstable_path, grid, info.crs)] = np.nan
-    found = sample(values, rows - row0, columns - column0, interpolation="linear", border=np.nan)
-    return found + heights.undulation_at(lonlath[:, :2], dem_heights)
+
+    def heights_at(lonlat):
+        places = grid.pixels(np.stack(to_map.transform(lonlat[:, 0], lonlat[:, 1]), axis=-1))
+        rows, columns = (np.where(np.isfinite(place), place, -9.0) for place in places)
+        return sample(values, rows, columns, interpolation="linear", border=np.nan).astype(float)
+
+    return heights_at
+
+
+def outline(camera):
+    """Film points along the edge of a film."""
+    x = np.linspace(-camera.half_length_mm, camera.half_length_mm, 25)
+    return np.concatenate([np.column_stack([x, np.full(25, y)]) for y in (-camera.half_width_mm, camera.half_width_mm)])
+
+
+def check_errors(adjustment, checks, ties, held_out, reference, gate_sigma):
+    """Errors at check points, and of heights at tie points in the blocks held out."""
+    origin = adjustment.cameras[0].origin
+    found = [np.empty((0, 3))]
+    for points, weights, chosen in zip(ties, adjustment.tie_weights, held_out, strict=True):
+        ground, _ = precision.intersect(adjustment.cameras, points)
+        found.append(origin.geodetic_from_local(ground[chosen & (weights > 0)]))
+    lonlath = np.concatenate(found)
+    return blocks.check_errors(
+        adjustment.cameras,
+        checks,
+        tie_heights_m=lonlath[:, 2],
+        reference_heights_m=reference.heights_at(lonlath[:, :2]),
+        gate_sigma=gate_sigma,
+    )
+
+
+def mean_height_m(adjustment, ties):
+    """Mean ellipsoidal height of the tie points of a pair; 0 without any."""
+    ground, _ = precision.intersect(adjustment.cameras, ties)
+    height = adjustment.cameras[0].origin.geodetic_from_local(ground)[:, 2]
+    return float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
+
+
+def write_field(path, camera):
+    """Displacement of a film on a grid, along and across, in mm."""
+    places, displacement = blocks.field_grid(camera, FIELD_GRID_MM)
+    rasters.write(
+        path,
+        np.moveaxis(displacement, -1, 0).astype(np.float32),
+        grid=PixelGrid(places[0, 0, 0], places[0, 0, 1], FIELD_GRID_MM, -FIELD_GRID_MM, places.shape[:2]),
+        crs=rasters.FILM_CRS,
+        descriptions=("dx_mm", "dy_mm"),
+    )
+
+
+def film_field(camera, control, pixel_mm):
+    """The field of one film, to be drawn."""
+    nodes, displacement = blocks.field_grid(camera, 2.0 * FIELD_GRID_MM)
+    size = np.sqrt(np.mean(displacement**2, axis=(0, 1))) * 1000.0
+    caption = f"film distortion, rms {size[0]:.1f} um along, {size[1]:.1f} um across; {len(control)} control points"
+    return FilmResiduals(camera.scene, nodes, displacement / pixel_mm, control.film_mm, caption)
 
 
 def gcp_residuals(camera, gcps, weights, pixel_mm):
@@ -253,12 +353,23 @@ if __name__ == "__main__":
             reference_dem_path=snakemake.input.reference_dem,
             unstable_path=snakemake.input.get("unstable_terrain"),
             cameras_folder=snakemake.output.cameras,
+            fields_folder=snakemake.output.fields,
+            height_sigma_folder=snakemake.output.height_sigma,
             summary_path=snakemake.output.summary,
             residuals_path=snakemake.output.residuals,
             figure_path=snakemake.output.figure,
+            field_figure_path=snakemake.output.field_figure,
             scenes=snakemake.params.scenes,
             pairs=snakemake.params.pairs,
+            pair_names=snakemake.params.pair_names,
             reference_dem_heights=snakemake.params.reference_dem_heights,
+            model=snakemake.params.model,
+            knots_along_mm=snakemake.params.knots_along_mm,
+            knots_across_mm=snakemake.params.knots_across_mm,
+            correlation_lengths_mm=snakemake.params.correlation_lengths_mm,
+            reference_sigma_m=snakemake.params.reference_sigma_m,
+            reference_sigma_horizontal_m=snakemake.params.reference_sigma_horizontal_m,
+            max_slope_deg=snakemake.params.max_slope_deg,
             film_distortion_um=snakemake.params.film_distortion_um,
             tie_distortion_um=snakemake.params.tie_distortion_um,
             gate_sigma=snakemake.params.gate_sigma,

@@ -1,16 +1,21 @@
 """Make ground control of a film's matches: filtered, with heights and covariances, half of it held back."""
 
+import logging
+from dataclasses import asdict
 from functools import partial
 
 import numpy as np
 import pandas as pd
 
-from cosp.io import rasters, records, references, tables, vectors
+from cosp.io import films, gcps, rasters, records, references, tables, vectors
 from cosp.io.logs import log_to
+from cosp.matching.consistency import places_of, reference_shift
 from cosp.matching.control import collect
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Footprint
 from cosp.matching.ground import map_crs
+
+log = logging.getLogger("collect_gcps")
 
 
 def collect_gcps(
@@ -18,7 +23,9 @@ def collect_gcps(
     film_path,
     footprint_path,
     reference_dem_path,
+    reference_image_path,
     unstable_terrain_path,
+    own_gcps_path,
     gcps_path,
     summary_path,
     *,
@@ -31,8 +38,11 @@ def collect_gcps(
     per_cell,
     max_slope_deg,
     white,
+    scratch_grey,
     reference_sigma_m,
     dem_sigma_m,
+    shift_search_m,
+    correct_reference_shift,
     check_columns,
     check_rows,
     min_gcps,
@@ -40,15 +50,46 @@ def collect_gcps(
 ):
     camera = records.read(footprint_path, Footprint).camera
     crs = map_crs(camera)
-    film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
-    gcps, summary = collect(
+    film = FilmImage(films.film_grid(film_path, footprint_path), lambda window: rasters.read(film_path, window=window))
+    heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
+    dem_posting_m = references.posting_m(reference_dem_path)
+    shift_m, shift = (0.0, 0.0), None
+    if reference_image_path and shift_search_m > 0:
+        found = reference_shift(
+            references.image_on(reference_image_path, crs),
+            heights_on,
+            places_of(camera, crs),
+            posting_m=max(dem_posting_m, references.posting_m(reference_image_path)),
+            search_m=shift_search_m,
+            threads=1,
+        )
+        corrected = correct_reference_shift and found.significant
+        shift = {**asdict(found), "corrected": corrected}
+        if corrected:
+            shift_m = (found.east_m, found.north_m)
+        if found.significant:
+            log.warning(
+                "places in the reference image need %+.0f m east and %+.0f m north to fit the reference DEM%s",
+                found.east_m,
+                found.north_m,
+                ", which they got" if corrected else "; correct_reference_shift would add that",
+            )
+    own = None
+    if own_gcps_path:
+        own = gcps.read(own_gcps_path)
+        own = own[own["scene"] == camera.scene].drop(columns="scene").reset_index(drop=True)
+        own[["x_mm", "y_mm"]] *= films.signs(footprint_path)  # measured on the raster
+        log.info("%d points of %s are on this film", len(own), own_gcps_path)
+    table, summary = collect(
         pd.concat([tables.read(path) for path in matches_paths], ignore_index=True),
         film,
         camera,
-        heights_on=references.heights_on(reference_dem_path, crs, reference_dem_heights),
+        heights_on=heights_on,
         unstable_on=partial(vectors.rasterise, unstable_terrain_path, crs=crs) if unstable_terrain_path else None,
         crs=crs,
-        dem_posting_m=references.posting_m(reference_dem_path),
+        dem_posting_m=dem_posting_m,
+        reference_shift_m=shift_m,
+        own=own,
         tile_mm=tile_mm,
         gate_px=gate_px,
         min_per_tile=min_per_tile,
@@ -57,6 +98,7 @@ def collect_gcps(
         per_cell=per_cell,
         max_slope_deg=max_slope_deg,
         white=white,
+        scratch_grey=scratch_grey,
         reference_sigma_m=reference_sigma_m,
         dem_sigma_m=dem_sigma_m,
         check_columns=check_columns,
@@ -64,8 +106,10 @@ def collect_gcps(
         min_gcps=min_gcps,
         rng=np.random.default_rng(seed),
     )
-    tables.write(gcps_path, gcps)
-    records.write(summary_path, {"kind": "gcps", "version": 1, "scene": camera.scene, **summary})
+    tables.write(gcps_path, table)
+    records.write(
+        summary_path, {"kind": "gcps", "version": 1, "scene": camera.scene, **summary, "reference_shift": shift}
+    )
 
 
 if __name__ == "__main__":
@@ -75,7 +119,9 @@ if __name__ == "__main__":
             film_path=snakemake.input.film,
             footprint_path=snakemake.input.footprint,
             reference_dem_path=snakemake.input.reference_dem,
+            reference_image_path=snakemake.input.get("reference_image"),
             unstable_terrain_path=snakemake.input.get("unstable_terrain"),
+            own_gcps_path=snakemake.input.get("own_gcps"),
             gcps_path=snakemake.output.gcps,
             summary_path=snakemake.output.summary,
             reference_dem_heights=snakemake.params.reference_dem_heights,
@@ -87,8 +133,11 @@ if __name__ == "__main__":
             per_cell=snakemake.params.per_cell,
             max_slope_deg=snakemake.params.max_slope_deg,
             white=snakemake.params.white,
+            scratch_grey=snakemake.params.scratch_grey,
             reference_sigma_m=snakemake.params.reference_sigma_m,
             dem_sigma_m=snakemake.params.dem_sigma_m,
+            shift_search_m=snakemake.params.shift_search_m,
+            correct_reference_shift=snakemake.params.correct_reference_shift,
             check_columns=snakemake.params.check_columns,
             check_rows=snakemake.params.check_rows,
             min_gcps=snakemake.params.min_gcps,

@@ -1,24 +1,33 @@
-"""Resample the joined film so that it is straight, clipped and in the fore sense."""
+"""Resample the parts once into the film: joined, straight, clipped and in the fore sense."""
 
 import itertools
 import logging
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
-from cosp.film.bending import choose_bending, film_grid, joined_window, straighten
+import numpy as np
+
+from cosp.film.arrangement import Pose, posed
+from cosp.film.bending import choose_bending, film_grid, straighten
 from cosp.film.exposure import Exposure
+from cosp.film.joining import Layout
 from cosp.film.stripes import Trace
+from cosp.geometry.statistics import nmad
 from cosp.imaging.windows import tiles
 from cosp.io import rasters, records, tables
 from cosp.io.logs import log_to
+from cosp.report import figures
+from cosp.report.film import draw_straightness
 
 
 def correct_bending(
-    stitched_path,
+    part_paths,
     seams_path,
     exposure_path,
     stripes_path,
     film_path,
     summary_path,
+    figure_path,
     *,
     scene,
     camera,
@@ -36,12 +45,14 @@ def correct_bending(
     log = logging.getLogger("correct_bending")
     exposure = records.read(exposure_path, Exposure)
     seams = records.read_json(seams_path)
-    traces = {"stripe": [], "edge": []}
+    traces, holes = {"stripe": [], "edge": []}, {}
     for (line, side), rows in tables.read(stripes_path).groupby(["line", "side"]):
         if line in traces:
             traces[line].append(
                 Trace(side, rows["x_mm"].to_numpy(), rows["y_mm"].to_numpy(), rows["strength"].to_numpy())
             )
+        if line == "hole" and len(rows):
+            holes[side] = rows[["x_mm", "y_mm"]].to_numpy()
     bending = choose_bending(
         exposure,
         stripes=traces["stripe"],
@@ -54,14 +65,21 @@ def correct_bending(
         single_sd_mm=single_sd_mm,
         none_sd_mm=none_sd_mm,
     )
+    used = {"stripes": traces["stripe"], "edges": traces["edge"], "none": []}[bending.source]
+    left = {trace.side: straightened(bending, trace.x_mm, trace.y_mm) for trace in used}
+    holes = {side: straightened(bending, *xy.T) for side, xy in holes.items()}
+    figures.save(
+        draw_straightness(left, holes, title=f"{scene}: straightened by {bending.source}"), figure_path, dpi=100
+    )
     turned = look == "aft"
     half_length_mm = exposure.half_length_mm - clip_mm
     grid = film_grid(exposure, half_length_mm=half_length_mm, half_width_mm=exposure.half_width_mm)
-    joined_shape = rasters.info(stitched_path).shape
     windows = tiles(grid.shape, (grid.shape[0], 2048))
+    layout = records.from_plain(seams["layout"], Layout, f"{seams_path}: layout")
+    parts = laid_parts(part_paths, seams)
 
-    def straight(source, image, window):
-        return straighten(image, source, grid, window, exposure, bending, turned=turned)
+    def straight(window):
+        return straighten(parts, layout, grid, window, exposure, bending, turned=turned)
 
     with (
         rasters.create(film_path, shape=grid.shape, dtype="uint8", grid=grid, crs=rasters.FILM_CRS, nodata=0) as film,
@@ -69,9 +87,7 @@ def correct_bending(
     ):
         for start in range(0, len(windows), threads):
             batch = windows[start : start + threads]
-            sources = [joined_window(grid, window, exposure, bending, joined_shape, turned=turned) for window in batch]
-            images = [rasters.read(stitched_path, window=source) for source in sources]
-            for window, values in zip(batch, pool.map(straight, sources, images, batch), strict=True):
+            for window, values in zip(batch, pool.map(straight, batch), strict=True):
                 film.write(window, values)
             log.info("straightened %d/%d windows", min(start + threads, len(windows)), len(windows))
 
@@ -93,7 +109,10 @@ def correct_bending(
             "mirrored": seams["mirrored"],
             "bending": bending,
             "exposure": exposure,
-            "centre_sd_mm": exposure.centre_sd_mm,
+            "centre_sd_mm": (exposure.centre_sd_mm[0], float(np.hypot(exposure.centre_sd_mm[1], bending.sd_mm))),
+            "rail_holes": [
+                {"side": side, "count": len(xy), "deviation_nmad_mm": nmad(xy[:, 1])} for side, xy in holes.items()
+            ],
             "lines": [
                 {"line": line, "side": trace.side, "share": trace.share, "noise_mm": trace.noise_mm}
                 for line, trace in itertools.chain.from_iterable(
@@ -104,15 +123,29 @@ def correct_bending(
     )
 
 
+def laid_parts(part_paths, seams):
+    """Parts as they lie in the joined film, left to right."""
+    by_name = {Path(path).stem: path for path in part_paths}
+    poses = [Pose(*pose) for pose in zip(seams["turned"], seams["mirrored"], strict=True)]
+    return [posed(rasters.read(by_name[name]), pose) for name, pose in zip(seams["part_order"], poses, strict=True)]
+
+
+def straightened(bending, x_mm, y_mm):
+    """Places (N, 2) on the straight film, their heights from their own median."""
+    places = bending.straight(np.column_stack([x_mm, y_mm]))
+    return places - [0.0, np.nanmedian(places[:, 1]) if np.isfinite(places[:, 1]).any() else 0.0]
+
+
 if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         correct_bending(
-            stitched_path=snakemake.input.stitched,
+            part_paths=list(snakemake.input.parts),
             seams_path=snakemake.input.seams,
             exposure_path=snakemake.input.exposure,
             stripes_path=snakemake.input.stripes,
             film_path=snakemake.output.film,
             summary_path=snakemake.output.summary,
+            figure_path=snakemake.output.figure,
             scene=snakemake.wildcards.scene,
             camera=snakemake.params.camera,
             look=snakemake.params.look,

@@ -24,6 +24,7 @@ def match_dense(
     least_texture_sd,
     saturated_from,
     least_correlation,
+    least_uniqueness,
     largest_speckle_px,
     speckle_step_px,
     threads,
@@ -47,6 +48,7 @@ def match_dense(
         least_texture_sd=least_texture_sd,
         saturated_from=saturated_from,
         least_correlation=least_correlation,
+        least_uniqueness=least_uniqueness,
         largest_speckle_px=largest_speckle_px,
         speckle_step_px=speckle_step_px,
         threads=threads,
@@ -59,10 +61,10 @@ def match_dense(
         dtype=np.float32,
         grid=header.grid.window(first, last, 0, columns),
         crs=header.crs,
-        count=3,
-        descriptions=("disparity", "validity", "confidence"),
+        count=4,
+        descriptions=("disparity", "validity", "confidence", "similarity"),
     ) as strip_file:
-        for band, values in enumerate((found.disparity, found.validity, found.confidence), start=1):
+        for band, values in enumerate((found.disparity, found.validity, found.confidence, found.similarity), start=1):
             strip_file.write(None, values[inside].astype(np.float32, copy=False), band)
 
 
@@ -93,6 +95,7 @@ if __name__ == "__main__":
             least_texture_sd=snakemake.params.least_texture_sd,
             saturated_from=snakemake.params.saturated_from,
             least_correlation=snakemake.params.least_correlation,
+            least_uniqueness=snakemake.params.least_uniqueness,
             largest_speckle_px=snakemake.params.largest_speckle_px,
             speckle_step_px=snakemake.params.speckle_step_px,
             threads=snakemake.threads,

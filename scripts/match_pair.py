@@ -3,13 +3,13 @@
 import numpy as np
 import pandas as pd
 
-from cosp.io import rasters, records, references, tables
+from cosp.io import films, rasters, records, references, tables
 from cosp.io.logs import log_to
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Footprint
-from cosp.matching.ground import map_crs
+from cosp.matching.ground import Terrain, map_bounds, map_crs
 from cosp.matching.matchers import matcher_by_name
-from cosp.matching.ties import match_films
+from cosp.matching.ties import match_films, summary
 
 
 def match_pair(
@@ -19,6 +19,7 @@ def match_pair(
     aft_footprint_path,
     reference_dem_path,
     tie_points_path,
+    summary_path,
     *,
     reference_dem_heights,
     matcher,
@@ -38,16 +39,20 @@ def match_pair(
 ):
     fore_camera, aft_camera = (records.read(p, Footprint).camera for p in (fore_footprint_path, aft_footprint_path))
     crs = map_crs(fore_camera)
+    heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
     fore, aft = (
-        FilmImage(rasters.info(path).grid, lambda window, path=path: rasters.read(path, window=window))
-        for path in (fore_film_path, aft_film_path)
+        FilmImage(films.film_grid(path, footprint_path), lambda window, path=path: rasters.read(path, window=window))
+        for path, footprint_path in (
+            (fore_film_path, fore_footprint_path),
+            (aft_film_path, aft_footprint_path),
+        )
     )
     ties = match_films(
         fore,
         aft,
         fore_camera,
         aft_camera,
-        heights_on=references.heights_on(reference_dem_path, crs, reference_dem_heights),
+        heights_on=heights_on,
         crs=crs,
         matcher=matcher_by_name(
             matcher,
@@ -77,6 +82,9 @@ def match_pair(
         "score": ties.score,
     }
     tables.write(tie_points_path, pd.DataFrame(table))
+    head = {"kind": "tie_points", "version": 1, "fore": fore_camera.scene, "aft": aft_camera.scene}
+    height_m = Terrain.on(heights_on, map_bounds(fore_camera, crs), crs, 1000.0).mean_m
+    records.write(summary_path, {**head, **summary(ties, fore_camera, aft_camera, height_m=height_m)})
 
 
 if __name__ == "__main__":
@@ -88,6 +96,7 @@ if __name__ == "__main__":
             aft_footprint_path=snakemake.input.aft_footprint,
             reference_dem_path=snakemake.input.reference_dem,
             tie_points_path=snakemake.output.tie_points,
+            summary_path=snakemake.output.summary,
             reference_dem_heights=snakemake.params.reference_dem_heights,
             matcher=snakemake.params.matcher,
             template_px=snakemake.params.template_px,

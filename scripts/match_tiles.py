@@ -3,13 +3,14 @@
 import pandas as pd
 
 from cosp.imaging.windows import strip_of
-from cosp.io import rasters, records, references, tables
+from cosp.io import films, rasters, records, references, tables
 from cosp.io.logs import log_to
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Footprint
 from cosp.matching.ground import control_tiles, map_crs, match_strip
-from cosp.matching.matchers import matcher_by_name
+from cosp.matching.matchers import LEARNED, matcher_by_name
 from cosp.matching.relief import relief_reference, relief_sigma_m
+from cosp.matching.wide_tiles import match_wide_strip
 
 
 def match_tiles(
@@ -28,6 +29,10 @@ def match_tiles(
     max_ratio,
     max_return_px,
     candidates,
+    features,
+    max_features,
+    tile_px,
+    superglue_weights,
     threads,
 ):
     footprint = records.read(footprint_path, Footprint)
@@ -38,31 +43,49 @@ def match_tiles(
         reference_on = references.image_on(reference_image_path, crs)
         reference_posting_m = references.posting_m(reference_image_path)
     else:
-        reference_on = relief_reference(heights_on, footprint.sun_azimuth_deg)
+        reference_on = relief_reference(heights_on, footprint.sun_azimuth_deg, footprint.sun_elevation_deg)
         reference_posting_m = references.posting_m(reference_dem_path)
-    film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
-    tiles_mm = control_tiles(camera, candidates)
-    first, last = strip_of(len(tiles_mm), scatteritem)
-    matches, posting_m, pixel_m = match_strip(
-        film,
-        camera,
-        tiles_mm[first:last],
-        reference_on=reference_on,
-        heights_on=heights_on,
-        crs=crs,
-        matcher=matcher_by_name(
-            matcher,
-            template_px=template_px,
-            search_px=search_px,
-            min_score=min_score,
-            max_ratio=max_ratio,
-            max_return_px=max_return_px,
-        ),
-        reference_posting_m=reference_posting_m,
+    film = FilmImage(films.film_grid(film_path, footprint_path), lambda window: rasters.read(film_path, window=window))
+    chosen = matcher_by_name(
+        matcher,
         template_px=template_px,
         search_px=search_px,
-        threads=threads,
+        min_score=min_score,
+        max_ratio=max_ratio,
+        max_return_px=max_return_px,
+        features=features,
+        max_features=max_features,
+        superglue_weights=superglue_weights,
     )
+    if matcher in LEARNED:
+        matches, posting_m, pixel_m = match_wide_strip(
+            film,
+            camera,
+            scatteritem,
+            reference_on=reference_on,
+            heights_on=heights_on,
+            crs=crs,
+            matcher=chosen,
+            reference_posting_m=reference_posting_m,
+            tile_px=tile_px,
+            threads=threads,
+        )
+    else:
+        tiles_mm = control_tiles(camera, candidates)
+        first, last = strip_of(len(tiles_mm), scatteritem)
+        matches, posting_m, pixel_m = match_strip(
+            film,
+            camera,
+            tiles_mm[first:last],
+            reference_on=reference_on,
+            heights_on=heights_on,
+            crs=crs,
+            matcher=chosen,
+            reference_posting_m=reference_posting_m,
+            template_px=template_px,
+            search_px=search_px,
+            threads=threads,
+        )
     sigma_m = matches.sigma_m if reference_image_path else relief_sigma_m(matches.sigma_m, posting_m)
     lonlath = matches.lonlath(crs)
     table = {
@@ -94,5 +117,9 @@ if __name__ == "__main__":
             max_ratio=snakemake.params.max_ratio,
             max_return_px=snakemake.params.max_return_px,
             candidates=snakemake.params.candidates,
+            features=snakemake.params.features,
+            max_features=snakemake.params.max_features,
+            tile_px=snakemake.params.tile_px,
+            superglue_weights=snakemake.params.superglue_weights,
             threads=snakemake.threads,
         )

@@ -6,6 +6,7 @@ import numpy as np
 
 from cosp.epipolar.parallax import measure_y_parallax as measure
 from cosp.epipolar.parallax import node_grid
+from cosp.epipolar.patches import image_patches
 from cosp.epipolar.rectification import Rectification
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
@@ -31,9 +32,8 @@ def measure_y_parallax(
     nodes = node_grid(rectification.shape, spacing_px=spacing_px, fewest_nodes=fewest_nodes)
     centres = nodes.centres()
     found = measure(
-        lambda window: rasters.read(fore_path, window=window),
-        lambda window: rasters.read(aft_path, window=window),
-        rectification.shape,
+        image_patches(lambda window: rasters.read(fore_path, window=window), rectification.shape),
+        image_patches(lambda window: rasters.read(aft_path, window=window), rectification.shape),
         nodes,
         rectification.disparity_bounds(centres[..., 1], centres[..., 0]),
         template_px=template_px,

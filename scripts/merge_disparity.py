@@ -37,8 +37,8 @@ def merge_disparity(strip_paths, disparity_path, validity_path, summary_path):
             dtype=np.uint8,
             grid=grid,
             crs=top.crs,
-            count=2,
-            descriptions=("validity", "confidence"),
+            count=3,
+            descriptions=("validity", "confidence", "similarity"),
         ) as validity_file,
     ):
         row = 0
@@ -46,12 +46,15 @@ def merge_disparity(strip_paths, disparity_path, validity_path, summary_path):
             rows = headers[path].shape[0]
             for start in range(0, rows, ROWS_AT_ONCE):
                 stop = min(start + ROWS_AT_ONCE, rows)
-                disparity, validity, confidence = rasters.read(path, band=None, window=Window(start, stop, 0, columns))
+                disparity, validity, confidence, similarity = rasters.read(
+                    path, band=None, window=Window(start, stop, 0, columns)
+                )
                 window = Window(row + start, row + stop, 0, columns)
                 disparity_file.write(window, disparity)
                 validity = validity.astype(np.uint8)
                 validity_file.write(window, validity, 1)
                 validity_file.write(window, confidence.astype(np.uint8), 2)
+                validity_file.write(window, similarity.astype(np.uint8), 3)
                 validity_counts += np.bincount(validity.ravel(), minlength=256)
                 samples.append(disparity[::SAMPLED_EVERY, ::SAMPLED_EVERY].ravel())
             row += rows

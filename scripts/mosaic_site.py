@@ -45,6 +45,7 @@ def mosaic_site(
     seam_paths,
     adjustment_paths,
     residual_figure_paths,
+    placement_figure_paths,
     camera_folders,
     reference_dem_path,
     unstable_path,
@@ -196,7 +197,13 @@ def mosaic_site(
         ),
         Section(
             "Ground control",
-            pictures=(picture(draw_control(points, half_width_mm=half_width_mm), "where control lies on the films"),),
+            pictures=(
+                picture(draw_control(points, half_width_mm=half_width_mm), "where control lies on the films"),
+                *(
+                    Picture(Path(path).read_bytes(), f"{scene}: search for its place, score of every shift")
+                    for scene, path in zip(scenes, placement_figure_paths, strict=True)
+                ),
+            ),
             details=(comparison("Control of each scene", named(scenes, gcp_summary_paths)),),
         ),
         Section(
@@ -324,6 +331,7 @@ if __name__ == "__main__":
             seam_paths=list(snakemake.input.seams),
             adjustment_paths=list(snakemake.input.adjustments),
             residual_figure_paths=list(snakemake.input.residual_figures),
+            placement_figure_paths=list(snakemake.input.placement_figures),
             camera_folders=list(snakemake.input.cameras),
             area_path=snakemake.input.area_of_interest or None,
             reference_dem_path=snakemake.input.reference_dem,

@@ -1,4 +1,4 @@
-"""Bring the fore film onto the map: film, camera and heights in, orthophoto out."""
+"""Bring a film onto the map: film, camera and heights in, orthophoto out."""
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
@@ -8,23 +8,30 @@ import numpy as np
 from cosp.camera.mapping import MapProjector
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
-from cosp.imaging.windows import tiles
-from cosp.io import rasters, records
+from cosp.imaging.windows import Window, tiles
+from cosp.io import films, rasters, records
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
 from cosp.surface.orthophoto import (
+    cells_below,
     direction_to_lens,
     fill_heights,
     film_window,
     heights_on,
     hidden_from_lens,
+    median_shift,
     nearest_on,
+    reach_of_occlusion,
     sample_film,
 )
+
+COARSE = 8  # cells over which heights are averaged to be compared with the reference DEM
+ROWS_AT_ONCE = 512
 
 
 def orthorectify(
     film_path,
+    footprint_path,
     camera_path,
     dem_path,
     reference_dem_path,
@@ -37,11 +44,23 @@ def orthorectify(
 ):
     log = logging.getLogger("orthorectify")
     camera = records.read(camera_path, PanoramicCamera)
-    film_grid = rasters.info(film_path).grid
+    film_grid = films.film_grid(film_path, footprint_path)
     dem = rasters.info(dem_path)
     grid, crs = dem.grid, dem.crs
-    reference = ellipsoidal_heights(reference_dem_path, grid, crs, reference_dem_heights)
-    heights_m = fill_heights(rasters.read(dem_path), reference)
+    coarse = ellipsoidal_heights(reference_dem_path, grid.coarsened(COARSE), crs, reference_dem_heights)
+    shift_m = median_shift(rasters.read_reduced(dem_path, COARSE), coarse)
+    highest_m = max(highest(dem_path, grid.shape), float(np.nanmax(coarse, initial=-np.inf)) + shift_m)
+
+    def filled(window):
+        """Heights of a window of the DEM, holes filled from the reference DEM."""
+        heights_m = rasters.read(dem_path, window=window)
+        if np.isfinite(heights_m).all():
+            return heights_m
+        part = grid.window(window.row0, window.row1, window.column0, window.column1)
+        return fill_heights(
+            heights_m, ellipsoidal_heights(reference_dem_path, part, crs, reference_dem_heights), shift_m
+        )
+
     projector = MapProjector(camera, crs, grid.bounds)
 
     def film_of(xy, height):
@@ -54,15 +73,17 @@ def orthorectify(
 
     def expose(tile):
         part = ortho_grid.window(tile.row0, tile.row1, tile.column0, tile.column1)
-        below, height = heights_on(heights_m, grid, part)
-        film_mm = film_of(part.centres(), height)
+        below = cells_below(grid, part)
+        ground = grid.window(below.row0, below.row1, below.column0, below.column1)
+        heights_m = filled(below)
+        film_mm = film_of(part.centres(), heights_on(heights_m, ground, part))
         window = film_window(film_grid, film_mm)
         if window is None:
             return np.zeros(tile.shape, np.uint8)
-        ground = grid.window(below.row0, below.row1, below.column0, below.column1)
-        hidden = hidden_from_lens(
-            heights_m, below, grid, *direction_to_lens(locate, ground, film_of), tolerance_m=tolerance_m
-        )
+        directions = direction_to_lens(locate, ground, film_of)
+        reach = reach_of_occlusion(float(np.nanmin(heights_m)), highest_m, *directions, grid)
+        around = below.grown(reach, grid.shape)
+        hidden = hidden_from_lens(filled(around), below.inside(around), grid, *directions, tolerance_m=tolerance_m)
         film = rasters.read(film_path, window=window)
         film_part = film_grid.window(window.row0, window.row1, window.column0, window.column1)
         return sample_film(film, film_part, film_mm, nearest_on(hidden, ground, part))
@@ -81,11 +102,18 @@ def orthorectify(
             log.info("exposed %d/%d tiles", min(start + threads, len(every)), len(every))
 
 
+def highest(dem_path, shape):
+    """Highest of the heights of a DEM, read by strips."""
+    strips = (Window(row, min(row + ROWS_AT_ONCE, shape[0]), 0, shape[1]) for row in range(0, shape[0], ROWS_AT_ONCE))
+    return max(float(np.nanmax(rasters.read(dem_path, window=strip), initial=-np.inf)) for strip in strips)
+
+
 if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         orthorectify(
             film_path=snakemake.input.film,
-            camera_path=f"{snakemake.input.cameras}/{snakemake.params.fore}.json",
+            footprint_path=snakemake.input.footprint,
+            camera_path=f"{snakemake.input.cameras}/{snakemake.params.scene}.json",
             dem_path=snakemake.input.dem,
             reference_dem_path=snakemake.input.reference_dem,
             ortho_path=snakemake.output.ortho,

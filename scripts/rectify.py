@@ -1,4 +1,7 @@
-"""Fit the epipolar geometry of a pair from its adjusted cameras, for the whole overlap or an area of interest."""
+"""Fit the epipolar geometry of a pair, for the whole overlap or an area of interest.
+
+From the adjusted cameras first; then y-parallax that the films still show is measured and taken out of the aft rows.
+"""
 
 import logging
 
@@ -7,10 +10,13 @@ from shapely import contains_xy, get_coordinates, segmentize
 
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.epipolar.correspondences import FilmMapping, height_range, virtual_conjugates
+from cosp.epipolar.parallax import fold_y_parallax, measure_y_parallax, node_grid
+from cosp.epipolar.patches import film_patches
 from cosp.epipolar.polynomials import Basis
 from cosp.epipolar.rectification import fit_rectification
 from cosp.geometry.grids import PixelGrid
-from cosp.io import records, vectors
+from cosp.io import films as films_of
+from cosp.io import rasters, records, vectors
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
 
@@ -23,8 +29,10 @@ AREA_POINTS = 60  # a side
 def rectify(
     fore_camera_path,
     aft_camera_path,
-    fore_summary_path,
-    aft_summary_path,
+    fore_film_path,
+    aft_film_path,
+    fore_footprint_path,
+    aft_footprint_path,
     reference_dem_path,
     area_of_interest_path,
     rectification_path,
@@ -36,6 +44,9 @@ def rectify(
     height_margin_m,
     disparity_margin_px,
     area_margin_px,
+    correction_spacing_px,
+    y_parallax,
+    threads,
 ):
     log = logging.getLogger("rectify")
     fore = records.read(fore_camera_path, PanoramicCamera)
@@ -44,7 +55,12 @@ def rectify(
         FilmMapping(camera.locate, camera.project, camera.half_length_mm, camera.half_width_mm)
         for camera in (fore, aft)
     )
-    pixel_mm = min(records.read_json(path)["pixel_mm"] for path in (fore_summary_path, aft_summary_path))
+    film_paths = (fore_film_path, aft_film_path)
+    film_grids = [
+        films_of.film_grid(path, footprint_path)
+        for path, footprint_path in zip(film_paths, (fore_footprint_path, aft_footprint_path), strict=True)
+    ]
+    pixel_mm = min(abs(grid.step_x) for grid in film_grids)
 
     if area_of_interest_path:
         lonlat = points_of_area(area_of_interest_path)
@@ -58,7 +74,8 @@ def rectify(
         virtual_conjugates(*films, np.linspace(low, high, LEVELS)),
         films,
         pixel_mm=pixel_mm,
-        basis=Basis(total_degree, total_degree, total=True) if total_degree else Basis(degree_along, degree_across),
+        # Epipolar lines run across the film.
+        basis=Basis(total_degree, total_degree, total=True) if total_degree else Basis(degree_across, degree_along),
         disparity_margin_px=disparity_margin_px,
     )
     log.info(
@@ -72,7 +89,28 @@ def rectify(
         window = rectification.window_of(fore.project_geodetic(ground), halo_px=area_margin_px)
         rectification = rectification.cut(window, margin_px=disparity_margin_px)
     log.info("%d rows, %d columns; disparity %.0f to %.0f px", *rectification.shape, *rectification.disparity_range_px)
+
+    if correction_spacing_px:
+        found = measure_on_films(rectification, film_paths, film_grids, correction_spacing_px, y_parallax, threads)
+        log.info("y-parallax taken out: %s", found.summary())
+        rectification = fold_y_parallax(rectification, found, smoothing_nodes=y_parallax["smoothing_nodes"])
     records.write(rectification_path, rectification)
+
+
+def measure_on_films(rectification, film_paths, film_grids, spacing_px, y_parallax, threads):
+    """y-parallax at places of the pair, for which only the films' windows about them are resampled."""
+    patches = [
+        film_patches(lambda window, path=path: rasters.read(path, window=window), grid, epipolar_map)
+        for path, grid, epipolar_map in zip(
+            film_paths, film_grids, (rectification.fore, rectification.aft), strict=True
+        )
+    ]
+    choices = {**y_parallax}
+    choices.pop("spacing_px")
+    nodes = node_grid(rectification.shape, spacing_px=spacing_px, fewest_nodes=choices.pop("fewest_nodes"))
+    centres = nodes.centres()
+    bounds = rectification.disparity_bounds(centres[..., 1], centres[..., 0])
+    return measure_y_parallax(*patches, nodes, bounds, **choices, threads=threads)
 
 
 def points_of_area(path):
@@ -100,8 +138,10 @@ if __name__ == "__main__":
         rectify(
             fore_camera_path=f"{snakemake.input.cameras}/{snakemake.params.fore}.json",
             aft_camera_path=f"{snakemake.input.cameras}/{snakemake.params.aft}.json",
-            fore_summary_path=snakemake.input.fore_summary,
-            aft_summary_path=snakemake.input.aft_summary,
+            fore_film_path=snakemake.input.fore_film,
+            aft_film_path=snakemake.input.aft_film,
+            fore_footprint_path=snakemake.input.fore_footprint,
+            aft_footprint_path=snakemake.input.aft_footprint,
             reference_dem_path=snakemake.input.reference_dem,
             area_of_interest_path=snakemake.input.area_of_interest,
             rectification_path=snakemake.output.rectification,
@@ -112,4 +152,7 @@ if __name__ == "__main__":
             height_margin_m=snakemake.params.height_margin_m,
             disparity_margin_px=snakemake.params.disparity_margin_px,
             area_margin_px=snakemake.params.area_margin_px,
+            correction_spacing_px=snakemake.params.correction_spacing_px,
+            y_parallax=snakemake.params.y_parallax,
+            threads=snakemake.threads,
         )

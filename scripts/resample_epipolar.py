@@ -7,21 +7,32 @@ from functools import partial
 from cosp.epipolar.rectification import Rectification
 from cosp.epipolar.resampling import resample_window
 from cosp.imaging.windows import tiles
-from cosp.io import rasters, records
+from cosp.io import films, rasters, records
 from cosp.io.logs import log_to
 
 TILE = 1024
 
 
 def resample_epipolar(
-    fore_film_path, aft_film_path, rectification_path, fore_path, aft_path, *, interpolation, threads
+    fore_film_path,
+    aft_film_path,
+    fore_footprint_path,
+    aft_footprint_path,
+    rectification_path,
+    fore_path,
+    aft_path,
+    *,
+    interpolation,
+    threads,
 ):
     rectification = records.read(rectification_path, Rectification)
-    resample(fore_film_path, rectification.fore, rectification.grid, fore_path, interpolation, threads)
-    resample(aft_film_path, rectification.aft, rectification.grid, aft_path, interpolation, threads)
+    fore_grid = films.film_grid(fore_film_path, fore_footprint_path)
+    aft_grid = films.film_grid(aft_film_path, aft_footprint_path)
+    resample(fore_film_path, fore_grid, rectification.fore, rectification.grid, fore_path, interpolation, threads)
+    resample(aft_film_path, aft_grid, rectification.aft, rectification.grid, aft_path, interpolation, threads)
 
 
-def resample(film_path, epipolar_map, grid, path, interpolation, threads):
+def resample(film_path, film_grid, epipolar_map, grid, path, interpolation, threads):
     """Write one rectified image, tile by tile."""
     log = logging.getLogger("resample_epipolar")
     windows = tiles(grid.shape, TILE)
@@ -29,7 +40,7 @@ def resample(film_path, epipolar_map, grid, path, interpolation, threads):
     one = partial(
         resample_window,
         lambda window: rasters.read(film_path, window=window),
-        rasters.info(film_path).grid,
+        film_grid,
         epipolar_map,
         interpolation=interpolation,
     )
@@ -51,6 +62,8 @@ if __name__ == "__main__":
         resample_epipolar(
             fore_film_path=snakemake.input.fore_film,
             aft_film_path=snakemake.input.aft_film,
+            fore_footprint_path=snakemake.input.fore_footprint,
+            aft_footprint_path=snakemake.input.aft_footprint,
             rectification_path=snakemake.input.rectification,
             fore_path=snakemake.output.fore,
             aft_path=snakemake.output.aft,

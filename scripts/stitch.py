@@ -1,25 +1,25 @@
-"""Join the digitised parts of a film: parts in, the joined film and a record of its seams out."""
+"""Find how the digitised parts of a film join: parts in, a record of their seams and places out."""
 
-import itertools
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from cosp.errors import InputError
 from cosp.film.arrangement import SeamLimits, arrange, posed
-from cosp.film.stitching import compose, lay_out, refine_seam, require_part
-from cosp.geometry.grids import PixelGrid
-from cosp.imaging.windows import tiles
+from cosp.film.joining import lay_out
+from cosp.film.scanner import find_steps, measure_overlap, steps_of_parts, without_steps
+from cosp.film.stitching import refine_seam, require_part
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
+from cosp.report import figures
+from cosp.report.film import SeamProfile, draw_seams
 
 
 def stitch(
     part_paths,
-    stitched_path,
     seams_path,
+    figure_path,
     *,
     scene,
     missing,
@@ -32,6 +32,10 @@ def stitch(
     min_margin,
     min_score,
     min_inliers,
+    step_search_px,
+    step_significance,
+    min_step_px,
+    step_tolerance_mm,
     feather_mm,
     part_width_mm,
     seed,
@@ -41,7 +45,7 @@ def stitch(
         raise InputError(f"{scene}: no such file: {', '.join(missing)}; needed are parts a to d, or one joined film")
     log = logging.getLogger("stitch")
     pixel_mm = pixel_um / 1000
-    names = [Path(path).stem for path in part_paths]
+    names, files = ([getattr(Path(path), what) for path in part_paths] for what in ("stem", "name"))
     for path in part_paths:
         found = rasters.info(path)
         require_part(
@@ -57,7 +61,7 @@ def stitch(
 
     rng = np.random.default_rng(seed)
     limits = SeamLimits(tuple(overlap_mm), offset_mm, feature_pixel_mm, ratio, min_features, min_margin)
-    arrangement = arrange(parts, names=names, pixel_mm=pixel_mm, limits=limits, rng=rng)
+    arrangement = arrange(parts, names=files, pixel_mm=pixel_mm, limits=limits, rng=rng)
     laid = [posed(parts[i], pose) for i, pose in zip(arrangement.order, arrangement.poses, strict=True)]
     order = [names[i] for i in arrangement.order]
     seams = []
@@ -69,27 +73,44 @@ def stitch(
                 coarse,
                 min_score=min_score,
                 min_inliers=min_inliers,
-                names=(order[k], order[k + 1]),
+                names=tuple(files[i] for i in arrangement.order[k : k + 2]),
                 rng=rng,
                 threads=threads,
             )
         )
         log.info("seam %d/%d: rms %.3f px", k + 1, len(arrangement.seams), seams[k].rms_px)
 
-    layout = lay_out([part.shape for part in laid], seams, feather_px=feather_mm / pixel_mm)
-    windows = tiles(layout.shape, (layout.shape[0], 2048))
-    grid = PixelGrid(0.0, 0.0, 1.0, -1.0, layout.shape)
-    with (
-        rasters.create(stitched_path, shape=layout.shape, dtype="uint8", grid=grid, crs=None) as target,
-        ThreadPoolExecutor(threads) as pool,
-    ):
-        for start in range(0, len(windows), threads):
-            batch = windows[start : start + threads]
-            composed = pool.map(compose, itertools.repeat(laid), itertools.repeat(layout), batch)
-            for window, values in zip(batch, composed, strict=False):
-                target.write(window, values)
-            log.info("joined %d/%d windows", min(start + threads, len(windows)), len(windows))
+    overlaps = [
+        measure_overlap(
+            laid[k], laid[k + 1], seam.motion, min_score=min_score, search_px=step_search_px, threads=threads
+        )
+        for k, seam in enumerate(seams)
+    ]
+    found, blocks = find_steps(
+        overlaps,
+        [seam.motion for seam in seams],
+        widths_px=[part.shape[1] for part in laid],
+        turned=[pose.turned for pose in arrangement.poses],
+        pixel_mm=pixel_mm,
+        min_significance=step_significance,
+        min_step_px=min_step_px,
+        tolerance_mm=step_tolerance_mm,
+    )
+    steps = steps_of_parts(found)
+    for k, jumps in enumerate(found):
+        log.info("seam %d/%d: %d steps of the scanner", k + 1, len(seams), len(jumps))
+        if jumps:
+            seams[k] = without_steps(seams[k], overlaps[k], steps[k], steps[k + 1])
 
+    layout = lay_out([part.shape for part in laid], seams, feather_px=feather_mm / pixel_mm, steps=steps)
+    figures.save(
+        draw_seams(
+            [profile(o, j, pixel_mm, order[k : k + 2]) for k, (o, j) in enumerate(zip(overlaps, found, strict=True))],
+            title=f"{scene}: residuals of the overlaps and steps of the scanner",
+        ),
+        figure_path,
+        dpi=100,
+    )
     records.write(
         seams_path,
         {
@@ -101,6 +122,7 @@ def stitch(
             "turned": [pose.turned for pose in arrangement.poses],
             "mirrored": [pose.mirrored for pose in arrangement.poses],
             "margin": arrangement.margin,
+            "scanner_blocks": blocks,
             "layout": layout,
             "seams": [
                 {
@@ -117,6 +139,12 @@ def stitch(
                     "gain": seam.gain,
                     "offset": seam.offset,
                     "residuals_px": seam.residuals.round(3),
+                    "steps": found[k],
+                    "profile": {
+                        "column_px": overlaps[k].column_px,
+                        "residual_px": overlaps[k].shift_px.round(4),
+                        "sd_px": overlaps[k].sd_px.round(4),
+                    },
                 }
                 for k, seam in enumerate(seams)
             ],
@@ -124,12 +152,21 @@ def stitch(
     )
 
 
+def profile(overlap, jumps, pixel_mm, names):
+    """What the figure of a seam shows."""
+    steps = np.zeros_like(overlap.shift_px)
+    for jump in jumps:
+        steps[overlap.column_px > jump.left_px] += jump.size_px
+    start = overlap.column_px[0] if len(overlap.column_px) else 0.0
+    return SeamProfile(" - ".join(names), (overlap.column_px - start) * pixel_mm, overlap.shift_px, steps)
+
+
 if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         stitch(
             part_paths=list(snakemake.input.parts),
-            stitched_path=snakemake.output.stitched,
             seams_path=snakemake.output.seams,
+            figure_path=snakemake.output.figure,
             scene=snakemake.wildcards.scene,
             missing=snakemake.params.missing,
             pixel_um=snakemake.params.pixel_um,
@@ -141,6 +178,10 @@ if __name__ == "__main__":
             min_margin=snakemake.params.min_margin,
             min_score=snakemake.params.min_score,
             min_inliers=snakemake.params.min_inliers,
+            step_search_px=snakemake.params.step_search_px,
+            step_significance=snakemake.params.step_significance,
+            min_step_px=snakemake.params.min_step_px,
+            step_tolerance_mm=snakemake.params.step_tolerance_mm,
             feather_mm=snakemake.params.feather_mm,
             part_width_mm=snakemake.params.part_width_mm,
             seed=snakemake.params.seed,

@@ -1,19 +1,27 @@
 """Find the exposed area of a joined film and trace its stripes and its long edges."""
 
 import logging
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from cosp.camera.missions import WIDTH_MM, mission_for
+from cosp.film.arrangement import Pose, posed
 from cosp.film.exposure import find_exposure
-from cosp.film.stripes import band_profiles, band_window, smooth_base, trace_edge, trace_ridge
+from cosp.film.joining import Layout, compose_reduced
+from cosp.film.rail_holes import find_rail_holes
+from cosp.film.stripes import band_profiles, smooth_base, trace_edge, trace_ridge
 from cosp.io import rasters, records, tables
 from cosp.io.logs import log_to
 
+# Rail holes are half a millimetre wide: their centres need no finer pixels.
+_HOLE_PIXEL_MM = 0.028
+
 
 def trace_stripes(
-    stitched_path,
+    part_paths,
+    seams_path,
     exposure_path,
     stripes_path,
     *,
@@ -31,13 +39,19 @@ def trace_stripes(
     min_contrast,
     min_step,
     outlier_mm,
+    hole_diameter_mm,
+    hole_spacing_mm,
+    hole_contrast,
 ):
     log = logging.getLogger("trace_stripes")
     pixel_mm = pixel_um / 1000
     mission = mission_for(camera)
+    seams = records.read_json(seams_path)
+    layout = records.from_plain(seams["layout"], Layout, f"{seams_path}: layout")
+    parts = laid_parts(part_paths, seams)
     factor = max(1, round(search_pixel_mm / pixel_mm))
     exposure = find_exposure(
-        rasters.read_reduced(stitched_path, factor),
+        compose_reduced(parts, layout, factor),
         pixel_mm=pixel_mm,
         factor=factor,
         length_mm=mission.scan_length_mm,
@@ -48,7 +62,6 @@ def trace_stripes(
     records.write(exposure_path, exposure)
     log.info("%s", exposure)
 
-    shape = rasters.info(stitched_path).shape
     count = int(2 * exposure.half_length_mm / step_mm)
     x_mm = (np.arange(count) - (count - 1) / 2) * step_mm
     half_width_mm = exposure.half_width_mm
@@ -56,10 +69,21 @@ def trace_stripes(
     def profiles(sign, reach_mm, base_mm):
         low, high = sorted(sign * reach for reach in reach_mm)
         y_mm = np.arange(high, low, -pixel_mm)
-        window = band_window(exposure, (base_mm.min() + low, base_mm.max() + high), shape)
-        image = rasters.read(stitched_path, window=window)
-        band = band_profiles(image, window, exposure, x_mm=x_mm, y_mm=y_mm, base_mm=base_mm, samples=samples)
-        return band, y_mm
+        return band_profiles(parts, layout, exposure, x_mm=x_mm, y_mm=y_mm, base_mm=base_mm, samples=samples), y_mm
+
+    def holes_table(side, x_mm, base_mm, reach_mm):
+        """Centres of the rail holes beside one edge of the picture; they are reported, and bend nothing."""
+        step_mm = max(pixel_mm, _HOLE_PIXEL_MM)
+        x = np.arange(x_mm[0], x_mm[-1], step_mm)
+        y = np.arange(reach_mm[1], reach_mm[0], -step_mm)
+        base = np.interp(x, x_mm, base_mm)
+        band = band_profiles(parts, layout, exposure, x_mm=x, y_mm=y, base_mm=base, samples=1)
+        holes = find_rail_holes(
+            band, x, y, diameter_mm=hole_diameter_mm, spacing_mm=hole_spacing_mm, min_contrast=hole_contrast
+        )
+        log.info("%s: %d rail holes", side, len(holes))
+        heights = holes[:, 1] + np.interp(holes[:, 0], x_mm, base_mm)
+        return pd.DataFrame({"line": "hole", "side": side, "x_mm": holes[:, 0], "y_mm": heights, "strength": 0.0})
 
     traced = []
     for side, sign in (("top", 1), ("bottom", -1)):
@@ -79,6 +103,7 @@ def trace_stripes(
                 min_contrast=min_contrast,
                 outlier_mm=outlier_mm,
             ).raised(base_mm)
+            traced.append(holes_table(side, x_mm, base_mm, sorted(sign * reach for reach in stripe_reach_mm)))
         for line, trace in lines.items():
             log.info("%s %s seen over %.0f %%, noise %.4f mm", side, line, 100 * trace.share, trace.noise_mm)
             traced.append(
@@ -87,10 +112,18 @@ def trace_stripes(
     tables.write(stripes_path, pd.concat(traced))
 
 
+def laid_parts(part_paths, seams):
+    """Parts as they lie in the joined film, left to right."""
+    by_name = {Path(path).stem: path for path in part_paths}
+    poses = [Pose(*pose) for pose in zip(seams["turned"], seams["mirrored"], strict=True)]
+    return [posed(rasters.read(by_name[name]), pose) for name, pose in zip(seams["part_order"], poses, strict=True)]
+
+
 if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         trace_stripes(
-            stitched_path=snakemake.input.stitched,
+            part_paths=list(snakemake.input.parts),
+            seams_path=snakemake.input.seams,
             exposure_path=snakemake.output.exposure,
             stripes_path=snakemake.output.stripes,
             camera=snakemake.params.camera,
@@ -107,4 +140,7 @@ if __name__ == "__main__":
             min_contrast=snakemake.params.min_contrast,
             min_step=snakemake.params.min_step,
             outlier_mm=snakemake.params.outlier_mm,
+            hole_diameter_mm=snakemake.params.hole_diameter_mm,
+            hole_spacing_mm=snakemake.params.hole_spacing_mm,
+            hole_contrast=snakemake.params.hole_contrast,
         )

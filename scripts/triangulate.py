@@ -9,11 +9,11 @@ from cosp.camera.panoramic import PanoramicCamera
 from cosp.epipolar.rectification import Rectification
 from cosp.errors import NoOverlapError
 from cosp.geometry.statistics import summarise
-from cosp.imaging.resampling import upsample_grid
 from cosp.imaging.windows import tiles
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
 from cosp.surface.intersection import height_per_pixel, intersect_tabulated, miss_limit, pixel_on_ground, tabulate_rays
+from cosp.surface.nodes import between_nodes
 
 WINDOW = (512, 2048)
 SMOOTH_BAND = 2  # of y_parallax.tif: the field that dense matching allowed for
@@ -56,33 +56,35 @@ def triangulate(
             np.linspace(a, b - 1, n)
             for (a, b, n) in ((window.row0, window.row1, 9), (window.column0, window.column1, 17))
         ]
+        at = [np.linspace(0, len(n) - 1, size) for n, size in zip(nodes, window.shape, strict=True)]
         ends = rectification.disparity_bounds(nodes[0][:, None], nodes[1][None, :])
-        at = np.meshgrid(
-            *(np.linspace(0, len(n) - 1, size) for n, size in zip(nodes, window.shape, strict=True)), indexing="ij"
-        )
-        return [upsample_grid(end.astype(np.float32), *at) for end in ends]
+        return [between_nodes(end, *at) for end in ends]
 
     def intersect(window, more_px=0.0):
-        rows = np.arange(window.row0, window.row1)[:, None]
-        columns = np.arange(window.column0, window.column1)[None, :]
+        rows, columns = np.arange(window.row0, window.row1), np.arange(window.column0, window.column1)
         disparity = rasters.read(disparity_path, window=window)
         low, high = bounds(window)
         disparity[(disparity < low) | (disparity > high)] = np.nan
         disparity += more_px
-        smooth = upsample_grid(y_parallax, *y_parallax_grid.pixels(disparity_info.grid.points(rows, columns)))
-        fore_mm, aft_mm = rectification.conjugate_points(rows, columns, disparity, smooth)
+        x, y = disparity_info.grid.points(0, columns)[:, 0], disparity_info.grid.points(rows, 0)[:, 1]
+        smooth = between_nodes(
+            y_parallax,
+            (y - y_parallax_grid.y0) / y_parallax_grid.step_y,
+            (x - y_parallax_grid.x0) / y_parallax_grid.step_x,
+        )
+        fore_mm, aft_mm = rectification.conjugate_points(rows[:, None], columns[None, :], disparity, smooth)
         return intersect_tabulated(*tables, fore_mm, aft_mm)
 
     windows = tiles(disparity_info.shape, WINDOW)
     sampled = windows[:: max(1, len(windows) // 24)]
-    first = [intersect(window) for window in sampled]
+    first = [thinned(intersect(window)) for window in sampled]
     range_m = np.concatenate([np.linalg.norm(ground - fore.position_m, axis=-1).ravel() for ground, _ in first])
     ground_px_m = pixel_on_ground(range_m, fore.focal_length_mm, rectification.pixel_mm)
     limit_m = miss_limit(
         np.concatenate([miss.ravel() for _, miss in first]), gate_sigmas=gate_sigmas, least_m=gate_px * ground_px_m
     )
     height_per_px_m = height_per_pixel(
-        [ground for ground, _ in first], [intersect(window, more_px=1.0)[0] for window in sampled]
+        [ground for ground, _ in first], [thinned(intersect(window, more_px=1.0))[0] for window in sampled]
     )
     if not np.isfinite(height_per_px_m):
         raise NoOverlapError(f"{disparity_path}: no disparity leads to a ground point; match_dense found nothing")
@@ -133,6 +135,11 @@ def triangulate(
             "blocks": blocks,
         },
     )
+
+
+def thinned(arrays):
+    """Every eighth row and column of arrays, for statistics."""
+    return [array[::8, ::8].copy() for array in arrays]
 
 
 if __name__ == "__main__":

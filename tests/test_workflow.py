@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -87,7 +88,7 @@ def test_every_script_of_the_project_has_a_digest_and_uses_its_stage() -> None:
         path.relative_to(workflow.LIBRARY).as_posix() for path in workflow.library_files(workflow.SCRIPTS / "stitch.py")
     }
     assert {"film/stitching.py", "io/rasters.py", "errors.py"} <= files
-    assert not any(file.startswith(("dense/", "dem/", "report/")) for file in files)
+    assert not any(file.startswith(("dense/", "dem/")) for file in files)
     assert len({workflow.script_digest(path.stem) for path in workflow.SCRIPTS.glob("*.py")}) > 5
 
 
@@ -167,3 +168,14 @@ def test_names_with_signs_are_taken_literally_by_the_wildcards() -> None:
     pattern = workflow.any_of(["a-b", "a.c"])
     assert re.fullmatch(pattern, "a.c")
     assert not re.fullmatch(pattern, "axc")
+    assert not re.match(workflow.any_of([]), "")
+
+
+@pytest.mark.parametrize(("formats", "blocks"), [([], []), (["rpc"], ["a", "b"])])
+def test_blocks_are_exported_where_a_form_is_asked_for(formats: list[str], blocks: list[str]) -> None:
+    fore = [replace(_scene(), scene=f"DS1104-2169DF09{i}", block=block) for i, block in enumerate("bab")]
+    aft = [replace(_scene(), scene=f"DS1104-2169DA09{i}", block=block) for i, block in enumerate("bab")]
+    pairs = {f"p{i}": sheets.Pair(f"p{i}", fore[i].scene, aft[i].scene) for i in range(3)}
+    scenes = {scene.scene: scene for scene in (*fore, *aft)}
+    project = sheets.Project({"export_cameras": {"formats": formats}}, scenes, pairs)
+    assert workflow.blocks_to_export(project) == blocks

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from cosp.adjustment import precision
 from cosp.adjustment.bundle import CONTROL_NEEDED, Adjustment, adjust
-from cosp.adjustment.observations import Control, Priors, Ties
+from cosp.adjustment.calibration import Calibration, FieldChoices, calibrate
+from cosp.adjustment.observations import FIELD_PRIORS, PLAIN_PRIORS, Control, HeightReference, Ties, orbit_coupling
 from cosp.adjustment.robust import Resection, resect
 from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.statistics import nmad, rms, summarise
+
+PointsT = TypeVar("PointsT", Control, Ties)
 
 # The single images are oriented by then: wide enough for what tie points still move.
 SECOND_START_SIGMA = 30.0
@@ -30,10 +33,16 @@ class OrientedBlock:
     adjustment : Adjustment
     resections : tuple of Resection or None
         Of every image by itself; None where its own control was too little.
+    calibration : Calibration or None
+        Film fields with everything about them, if they were asked for.
+    plain : Adjustment
+        The same block without film fields.
     """
 
     adjustment: Adjustment
     resections: tuple[Resection | None, ...]
+    calibration: Calibration | None
+    plain: Adjustment
 
 
 @dataclass(frozen=True)
@@ -63,14 +72,19 @@ def orient_block(
     control: Sequence[Control],
     ties: Sequence[Ties],
     *,
-    priors: Priors,
+    film_distortion_mm: float,
+    tie_distortion_mm: float,
     gate_sigma: float,
+    field: FieldChoices | None = None,
+    reference: HeightReference | None = None,
+    held_out: Sequence[BoolArray] | None = None,
+    film_groups: Sequence[int] | None = None,
 ) -> OrientedBlock:
     """Adjusted cameras of a block.
 
     Every image with control enough is first oriented by itself, with both scan directions tried; that finds the
     gross errors of its control and a start that tie points can be trusted with. Then all are adjusted together. The
-    cameras given stay the means of the priors.
+    cameras given stay the means of the priors. Last, if asked for, the distortion of the films joins the unknowns.
 
     Parameters
     ----------
@@ -79,15 +93,25 @@ def orient_block(
     control : sequence of Control
         One per image, empty where there is none.
     ties : sequence of Ties
-    priors : Priors
+    film_distortion_mm, tie_distortion_mm : float
+        Distortion of film that the plain model must allow for in the sigmas of control and of tie points.
     gate_sigma : float
         Points beyond this many standard deviations are gross errors.
+    field : FieldChoices or None
+        How to describe film distortion; None for the 13 parameters alone.
+    reference : HeightReference or None
+        Heights to hold tie points to; only with film fields.
+    held_out : sequence of (N,) arrays of bool
+        Tie points whose height is kept from the adjustment.
+    film_groups : sequence of int
+        Which images were taken by the same camera.
 
     Raises
     ------
     NotEnoughMatchesError
         If the block has too little control.
     """
+    allowed = [_allowing(points, film_distortion_mm) for points in control]
     resections = [
         resect(
             camera,
@@ -95,27 +119,124 @@ def orient_block(
             points.ground_m,
             sigma_px=points.sigma_mm,
             pixel_mm=1.0,
-            priors=priors,
+            priors=PLAIN_PRIORS,
             gate_sigma=gate_sigma,
             sigma_ground_m=points.sigma_ground_m,
             sigma_height_m=points.sigma_height_m,
         )
         if len(points) >= CONTROL_NEEDED
         else None
-        for camera, points in zip(cameras, control, strict=True)
+        for camera, points in zip(cameras, allowed, strict=True)
     ]
     start = [resection.camera if resection else camera for camera, resection in zip(cameras, resections, strict=True)]
     means = [replace(camera, scan_direction=found.scan_direction) for camera, found in zip(cameras, start, strict=True)]
-    adjustment = adjust(
+    plain = adjust(
         start,
-        control,
-        ties,
-        priors=priors,
+        allowed,
+        [_allowing(points, tie_distortion_mm) for points in ties],
+        priors=PLAIN_PRIORS,
         gate_sigma=gate_sigma,
         prior_cameras=means,
         start_sigma=SECOND_START_SIGMA,
     )
-    return OrientedBlock(adjustment, tuple(resections))
+    if field is None:
+        return OrientedBlock(plain, tuple(resections), None, plain)
+    calibration = calibrate(
+        plain.cameras,
+        control,
+        ties,
+        reference=reference,
+        priors=FIELD_PRIORS,
+        prior_cameras=means,
+        choices=field,
+        gate_sigma=gate_sigma,
+        control_weights=plain.control_weights,
+        tie_weights=plain.tie_weights,
+        held_out=held_out,
+        film_groups=film_groups,
+        coupling=_coupling(cameras, film_groups),
+    )
+    return OrientedBlock(_with_fields(calibration), tuple(resections), calibration, plain)
+
+
+def with_checks(
+    block: OrientedBlock,
+    control: Sequence[Control],
+    checks: Sequence[Control],
+    ties: Sequence[Ties],
+    *,
+    prior_cameras: Sequence[PanoramicCamera],
+    field: FieldChoices,
+    reference: HeightReference | None,
+    gate_sigma: float,
+    film_groups: Sequence[int] | None = None,
+) -> OrientedBlock:
+    """The block adjusted once more with its check points as control and no height held out.
+
+    What check points say of the first adjustment then holds for this one a fortiori: a film field knows less
+    where it saw no control.
+
+    Parameters
+    ----------
+    block : OrientedBlock
+        With film fields.
+    control, checks : sequences of Control
+        Per image.
+    ties : sequence of Ties
+    prior_cameras : sequence of PanoramicCamera
+    field, reference, gate_sigma, film_groups
+        As for `orient_block`.
+    """
+    if block.calibration is None:
+        return block
+    cameras = block.adjustment.cameras
+    means = [replace(mean, scan_direction=now.scan_direction) for mean, now in zip(prior_cameras, cameras, strict=True)]
+    calibration = calibrate(
+        cameras,
+        [_joined(points, more) for points, more in zip(control, checks, strict=True)],
+        ties,
+        reference=reference,
+        priors=FIELD_PRIORS,
+        prior_cameras=means,
+        choices=replace(field, lengths_mm=(block.calibration.prior.length_mm,)),
+        gate_sigma=gate_sigma,
+        film_groups=film_groups,
+        coupling=_coupling(cameras, film_groups),
+    )
+    return replace(block, adjustment=_with_fields(calibration), calibration=calibration)
+
+
+def _coupling(cameras: Sequence[PanoramicCamera], film_groups: Sequence[int] | None) -> FloatArray | None:
+    return None if film_groups is None else orbit_coupling([camera.scene for camera in cameras], film_groups)
+
+
+def _allowing(points: PointsT, distortion_mm: float) -> PointsT:
+    """Points whose sigmas allow for distortion of the film."""
+    return replace(points, sigma_mm=np.hypot(points.sigma_mm, distortion_mm))
+
+
+def _joined(first: Control, second: Control) -> Control:
+    return Control(*(np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Control)))
+
+
+def _with_fields(calibration: Calibration) -> Adjustment:
+    """A calibration as an adjustment of its cameras."""
+    square, images = 0.0, len(calibration.cameras)
+    for rows, weights in zip(calibration.rows, calibration.weights, strict=True):
+        used = weights > 0
+        square += float((weights[used, None] * rows.residuals[used] ** 2).sum())
+    columns = calibration.camera_columns()
+    ties = sum(rows.kind == "tie" for rows in calibration.rows)
+    return Adjustment(
+        cameras=calibration.cameras,
+        control_weights=calibration.weights[:images],
+        tie_weights=calibration.weights[images : images + ties],
+        covariance=calibration.covariance[np.ix_(columns, columns)],
+        sigma_naught=math.sqrt(square / max(calibration.redundancy, 1.0)),
+        redundancy=round(calibration.redundancy),
+        cost=calibration.cost,
+        iterations=calibration.iterations,
+    )
 
 
 def check_errors(
@@ -161,13 +282,16 @@ def check_errors(
 
 def summary(
     block: OrientedBlock,
+    final: OrientedBlock,
     control: Sequence[Control],
     ties: Sequence[Ties],
     checks: Sequence[Control],
     errors: CheckErrors,
+    plain_errors: CheckErrors,
     *,
     pixels_mm: Sequence[float],
-    priors: Priors,
+    film_distortion_mm: float,
+    tie_distortion_mm: float,
     correlation_limit: float,
 ) -> dict[str, Any]:
     """What is told of an adjustment: the content of adjustment.json.
@@ -175,20 +299,25 @@ def summary(
     Parameters
     ----------
     block : OrientedBlock
+        Adjusted without the check points: what residuals and errors are told of.
+    final : OrientedBlock
+        Of the cameras that are handed on; the same without film fields.
     control, checks : sequences of Control
         Per image.
     ties : sequence of Ties
-    errors : CheckErrors
+    errors, plain_errors : CheckErrors
+        Of `block`, and of the same block without film fields.
     pixels_mm : sequence of float
         Size of a digitised pixel per image.
-    priors : Priors
+    film_distortion_mm, tie_distortion_mm : float
+        What the plain model allowed for.
     correlation_limit : float
         Correlations beyond this are listed.
     """
     adjustment = block.adjustment
     cameras = adjustment.cameras
     pixel_mm = float(np.mean(pixels_mm))
-    correlated = precision.correlations(adjustment, correlation_limit)
+    correlated = precision.correlations(final.adjustment, correlation_limit)
     images = [
         {
             "scene": camera.scene,
@@ -199,12 +328,14 @@ def summary(
             "check_rms_px": _kept_rms(camera, held_out, np.ones(len(held_out), dtype=bool), size_mm),
             "scan_direction": camera.scan_direction,
             "other_direction_cost": resection.other_direction_cost if resection else None,
-            "image_motion_compensation": asdict(precision.compensation_of(camera)),
-            "paper_parameters": precision.paper_parameters(camera),
+            "image_motion_compensation": asdict(precision.compensation_of(adjusted)),
+            "paper_parameters": precision.paper_parameters(adjusted),
             "correlations": correlation,
+            "film_field": _field_size(adjusted),
         }
-        for camera, points, weights, held_out, resection, correlation, size_mm in zip(
+        for camera, adjusted, points, weights, held_out, resection, correlation, size_mm in zip(
             cameras,
+            final.adjustment.cameras,
             control,
             adjustment.control_weights,
             checks,
@@ -229,32 +360,71 @@ def summary(
                 "ray_gap_m": summarise(gap_m[kept]),
             }
         )
+    calibration = block.calibration
+    unknowns = 13.0 * len(cameras)
+    if calibration is None:
+        allowed = [_allowing(points, film_distortion_mm) for points in control]
+        groups = precision.plain_groups(adjustment, allowed, [_allowing(points, tie_distortion_mm) for points in ties])
+        scales = dict.fromkeys(("gcp", "tie"), 1.0)
+    else:
+        groups = list(calibration.rows), list(calibration.weights), list(calibration.variances)
+        scales = calibration.scales
+        used = sum(int((w > 0).sum()) * rows.residuals.shape[1] for rows, w in zip(*groups[:2], strict=True))
+        unknowns = used - calibration.redundancy
     return {
         "kind": "adjustment",
         "version": 1,
-        "sigma_naught_px": precision.sigma_naught_mm(adjustment, control, ties) / pixel_mm,
+        "model": "plain" if calibration is None else "field",
+        "sigma_naught_px": precision.sigma_naught_mm(adjustment, control, ties, unknowns) / pixel_mm,
         "sigma_naught": adjustment.sigma_naught,
         "redundancy": adjustment.redundancy,
         "iterations": adjustment.iterations,
         "pixel_mm": pixel_mm,
+        "film_field": None if calibration is None else asdict(calibration.prior),
+        "groups": precision.group_statistics(*groups, scales),
         "check": {
-            "rmse": {
-                "east_m": rms(errors.east_m[errors.kept]),
-                "north_m": rms(errors.north_m[errors.kept]),
-                "up_m": rms(errors.up_m[errors.up_kept]),
-            },
+            "rmse": _rmse(errors),
             "count": len(errors.kept),
             "rejected": int((~errors.kept).sum()),
             "up_count": len(errors.up_kept),
             "up_rejected": int((~errors.up_kept).sum()),
             "up": summarise(errors.up_m),
             "up_from": "tie points in the blocks held out, against the reference heights",
+            "rmse_without_field": _rmse(plain_errors),
         },
         "images": images,
         "pairs": pairs,
-        "priors": asdict(priors),
+        "priors": asdict(PLAIN_PRIORS if calibration is None else FIELD_PRIORS),
         "origin": asdict(cameras[0].origin),
     }
+
+
+def _rmse(errors: CheckErrors) -> dict[str, float]:
+    return {
+        "east_m": rms(errors.east_m[errors.kept]),
+        "north_m": rms(errors.north_m[errors.kept]),
+        "up_m": rms(errors.up_m[errors.up_kept]),
+    }
+
+
+def _field_size(camera: PanoramicCamera) -> dict[str, float] | None:
+    """Root mean square and largest displacement of a film field along and across the film, mm."""
+    if camera.film_field is None:
+        return None
+    displacement = field_grid(camera, 5.0)[1]
+    return {
+        "rms_x_mm": rms(displacement[..., 0]),
+        "rms_y_mm": rms(displacement[..., 1]),
+        "largest_mm": float(np.hypot(displacement[..., 0], displacement[..., 1]).max()),
+    }
+
+
+def field_grid(camera: PanoramicCamera, step_mm: float) -> tuple[FloatArray, FloatArray]:
+    """The field of a film on a grid: places (rows, columns, 2) and displacements, both in mm; rows run down."""
+    x = np.arange(-np.floor(camera.half_length_mm / step_mm), np.floor(camera.half_length_mm / step_mm) + 1) * step_mm
+    y = np.arange(np.floor(camera.half_width_mm / step_mm), -np.floor(camera.half_width_mm / step_mm) - 1, -1) * step_mm
+    places = np.stack(np.meshgrid(x, y), axis=-1)
+    return places, np.zeros_like(places) if camera.film_field is None else camera.film_field.displacement(places)
 
 
 def _within(values: FloatArray, gate_sigma: float) -> BoolArray:

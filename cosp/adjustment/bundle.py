@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosp.adjustment.observations import Control, Priors, Ties
+from cosp.adjustment.rows import Rows, control_rows, intersections, tie_rows
 from cosp.adjustment.solver import START_SIGMA, Equations, Solution, minimise
 from cosp.arrays import FloatArray
-from cosp.camera.derivatives import film_derivatives
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import NotEnoughMatchesError
-from cosp.geometry.rays import meet
 
 PARAMETERS = 13
 CONTROL_NEEDED = 7  # two equations each: one more than the 13 unknowns of an image
@@ -130,63 +129,23 @@ def adjust(
 
 
 def control_equations(camera: PanoramicCamera, control: Control, first_column: int = 0) -> Equations:
-    """Whitened equations of the control points of one image: two per point."""
-    film = camera.project(control.ground_m)
-    by_parameters, by_ground = film_derivatives(camera, control.ground_m, film)
-    variance = np.stack([control.sigma_ground_m**2, control.sigma_ground_m**2, control.sigma_height_m**2], axis=1)
-    covariance = np.einsum("nik,nk,njk->nij", by_ground, variance, by_ground)
-    covariance[:, [0, 1], [0, 1]] += control.sigma_mm[:, None] ** 2
-    whiten = _whitening(covariance)
-    return Equations(
-        columns=np.arange(first_column, first_column + PARAMETERS),
-        residuals=(whiten @ (control.film_mm - film)[..., None])[..., 0],
-        jacobian=whiten @ by_parameters,
-    )
+    """Whitened equations of the control points of one image in its parameters: two per point."""
+    return _of_cameras(control_rows(camera, control), [first_column])
 
 
 def tie_equations(cameras: Sequence[PanoramicCamera], ties: Ties) -> Equations:
-    """Whitened equations of tie points with their ground points eliminated: one per point."""
-    first, second = cameras[ties.first], cameras[ties.second]
-    ground, _ = meet(first.rays(ties.first_mm), second.rays(ties.second_mm))
-    parts = []
-    for camera, observed in ((first, ties.first_mm), (second, ties.second_mm)):
-        film = camera.project(ground)
-        parts.append((observed - film, *film_derivatives(camera, ground, film)))
-    (first_residual, first_by, first_ground), (second_residual, second_by, second_ground) = parts
+    """Whitened equations of tie points in the parameters of two images, ground points eliminated: one per point."""
+    rows = tie_rows(intersections(cameras, ties), ties)
+    return _of_cameras(rows, [PARAMETERS * image for image in rows.images])
 
-    by_ground = np.concatenate([first_ground, second_ground], axis=1)
-    condition = _left_null_vector(by_ground)
-    residual = (condition * np.concatenate([first_residual, second_residual], axis=1)).sum(1)
-    by_first = (condition[:, None, :2] @ first_by)[:, 0]
-    by_second = (condition[:, None, 2:] @ second_by)[:, 0]
-    columns = [np.arange(PARAMETERS * i, PARAMETERS * (i + 1)) for i in (ties.first, ties.second)]
+
+def _of_cameras(rows: Rows, first_columns: Sequence[int]) -> Equations:
+    jacobian = rows.by_camera()
     return Equations(
-        columns=np.concatenate(columns),
-        residuals=(residual / ties.sigma_mm)[:, None],
-        jacobian=(np.concatenate([by_first, by_second], axis=1) / ties.sigma_mm[:, None])[:, None, :],
+        columns=np.concatenate([np.arange(first, first + PARAMETERS) for first in first_columns]),
+        residuals=rows.residuals,
+        jacobian=jacobian.reshape(*jacobian.shape[:2], PARAMETERS * len(rows.images)),
     )
-
-
-def _whitening(covariance: FloatArray) -> FloatArray:
-    """Inverse of the lower Cholesky factor of (N, 2, 2) covariances; NaN stays NaN."""
-    a, b, c = covariance[:, 0, 0], covariance[:, 1, 0], covariance[:, 1, 1]
-    first = np.sqrt(a)
-    low = b / first
-    second = np.sqrt(c - low**2)
-    whiten = np.zeros_like(covariance)
-    whiten[:, 0, 0] = 1.0 / first
-    whiten[:, 1, 0] = -low / (first * second)
-    whiten[:, 1, 1] = 1.0 / second
-    return whiten
-
-
-def _left_null_vector(matrix: FloatArray) -> FloatArray:
-    """Unit vectors (N, 4) orthogonal to the columns of (N, 4, 3) matrices, by cofactors; NaN stays NaN."""
-    vector = np.empty(matrix.shape[:2])
-    for row in range(4):
-        rest = np.delete(matrix, row, axis=1)
-        vector[:, row] = (-1) ** row * np.einsum("ni,ni->n", rest[:, 0], np.cross(rest[:, 1], rest[:, 2]))
-    return np.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True))
 
 
 def _adjustment(cameras: list[PanoramicCamera], solution: Solution, information: FloatArray) -> Adjustment:

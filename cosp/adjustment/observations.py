@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,27 @@ class Ties:
 
     def __len__(self) -> int:
         return len(self.first_mm)
+
+
+@dataclass(frozen=True)
+class HeightReference:
+    """Heights of the ground that tie points may be held to.
+
+    Parameters
+    ----------
+    heights_at : function
+        Ellipsoidal heights (N,) of longitudes and latitudes (N, 2) in degrees; NaN where there are none and where the
+        ground may have changed.
+    sigma_m, sigma_horizontal_m : float
+        Standard deviations of its heights and, per axis, of its position.
+    largest_slope_deg : float
+        Steeper ground is left out.
+    """
+
+    heights_at: Callable[[FloatArray], FloatArray]
+    sigma_m: float
+    sigma_horizontal_m: float
+    largest_slope_deg: float
 
 
 @dataclass(frozen=True)
@@ -121,3 +143,34 @@ FIELD_PRIORS = Priors(
     rates_deg=(0.1, 0.5, 0.1),
     imc_factor=0.002,
 )
+
+
+# How little the motion of a spacecraft changes from one frame to the next, a few seconds later: change of position over
+# the scan (m), change of angles over the scan (degrees), image motion factor.
+SUCCESSIVE_VELOCITY_M = 20.0
+SUCCESSIVE_RATE_DEG = 0.03
+SUCCESSIVE_IMC = 0.0005
+
+
+def orbit_coupling(scenes: Sequence[str], film_groups: Sequence[int]) -> FloatArray:
+    """Information that ties the motions of successive frames of one camera to each other, (13 n, 13 n).
+
+    Position and attitude at mid-scan stay free: when a frame was taken is not known well enough.
+
+    Parameters
+    ----------
+    scenes : sequence of str
+        Archive ids, whose order is that of the frames.
+    film_groups : sequence of int
+        Which images were taken by the same camera.
+    """
+    count = len(scenes)
+    information = np.zeros((13 * count, 13 * count))
+    sigma = np.concatenate([[SUCCESSIVE_VELOCITY_M] * 3, np.radians([SUCCESSIVE_RATE_DEG] * 3), [SUCCESSIVE_IMC]])
+    moving = np.array([3, 4, 5, 9, 10, 11, 12])
+    for group in sorted(set(film_groups)):
+        frames = sorted((image for image in range(count) if film_groups[image] == group), key=lambda i: scenes[i])
+        for first, second in zip(frames, frames[1:], strict=False):
+            for a, b, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
+                information[13 * a + moving, 13 * b + moving] += sign / sigma**2
+    return information

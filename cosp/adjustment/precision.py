@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from cosp.adjustment.bundle import PARAMETERS, Adjustment
 from cosp.adjustment.observations import Control, Ties
+from cosp.adjustment.rows import Rows, control_rows, intersections, tie_rows
 from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.derivatives import PARAMETER_NAMES
 from cosp.camera.missions import GROUND_SPEED_KM_PER_SCAN, TILT_DEG
@@ -19,6 +20,8 @@ from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.rays import meet
 from cosp.geometry.rotations import rotation_matrix
 from cosp.geometry.statistics import rms
+
+BAARDA_LIMIT = 3.29  # a thousandth of the normal distribution lies beyond
 
 
 def film_residuals(camera: PanoramicCamera, film_mm: FloatArray, ground_m: FloatArray) -> FloatArray:
@@ -59,8 +62,8 @@ def in_held_out_blocks(film_mm: FloatArray, control_mm: FloatArray, check_mm: Fl
     return np.asarray(cKDTree(check_mm).query(film_mm)[0] < cKDTree(control_mm).query(film_mm)[0])
 
 
-def sigma_naught_mm(adjustment: Adjustment, control: Sequence[Control], ties: Sequence[Ties]) -> float:
-    """Standard deviation of a film coordinate from the residuals of all points kept, mm.
+def sigma_naught_mm(adjustment: Adjustment, control: Sequence[Control], ties: Sequence[Ties], unknowns: float) -> float:
+    """Standard deviation of a film coordinate from the residuals of all points kept, mm, with so many unknowns.
 
     Residuals of control stand as they are, of tie points as the one condition each of them gives.
 
@@ -81,8 +84,72 @@ def sigma_naught_mm(adjustment: Adjustment, control: Sequence[Control], ties: Se
         residual = np.concatenate([first, second], axis=1)[kept]
         square += float((weights[kept, None] * residual**2).sum())
         count += int(kept.sum())
-    unknowns = PARAMETERS * len(adjustment.cameras)
     return math.sqrt(square / (count - unknowns)) if count > unknowns else math.nan
+
+
+def group_statistics(
+    rows: Sequence[Rows], weights: Sequence[FloatArray], variances: Sequence[FloatArray], scales: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """Per kind of observation: variance component, redundancy and Baarda's tests of the single observations.
+
+    Parameters
+    ----------
+    rows : sequence of Rows
+    weights : sequence of (M,) arrays
+    variances : sequence of (M, K) arrays
+        Of what the rows compute, in units of their sigmas.
+    scales : mapping
+        By how much the sigmas of each kind were scaled.
+
+    References
+    ----------
+    [Baarda1968]; a good observation exceeds 3.29 in one of a thousand cases.
+    """
+    found = []
+    for kind in dict.fromkeys(group.kind for group in rows):
+        square = redundancy = 0.0
+        rejected = total = 0
+        tests = []
+        for group, weight, variance in zip(rows, weights, variances, strict=True):
+            if group.kind != kind:
+                continue
+            used = weight > 0
+            finite = np.isfinite(group.residuals).all(axis=1)
+            total += int(finite.sum())
+            rejected += int((finite & ~used).sum())
+            residuals, scale = group.residuals[used], scales[kind]
+            square += float((weight[used, None] * residuals**2).sum())
+            redundancy += residuals.size - float((weight[used, None] * variance[used]).sum()) / scale**2
+            tests.append((residuals / np.sqrt(np.maximum(scale**2 - variance[used], 1e-6 * scale**2))).ravel())
+        size = np.abs(np.concatenate(tests))
+        found.append(
+            {
+                "kind": kind,
+                "count": total,
+                "rejected": rejected,
+                "sigma_naught": math.sqrt(square / redundancy) if redundancy > 0 else math.nan,
+                "sigmas_scaled_by": scales[kind],
+                "redundancy": redundancy,
+                "w_tests": {"limit": BAARDA_LIMIT, "tested": size.size, "beyond": int((size > BAARDA_LIMIT).sum())},
+            }
+        )
+    return found
+
+
+def plain_groups(
+    adjustment: Adjustment, control: Sequence[Control], ties: Sequence[Ties]
+) -> tuple[list[Rows], list[FloatArray], list[FloatArray]]:
+    """Equations, weights and variances of what is computed, of an adjustment without film fields."""
+    rows = [control_rows(adjustment.cameras[i], points, i) for i, points in enumerate(control)]
+    rows += [tie_rows(intersections(adjustment.cameras, points), points) for points in ties]
+    variances = []
+    for group in rows:
+        jacobian = group.by_camera().reshape(*group.residuals.shape, PARAMETERS * len(group.images))
+        columns = np.concatenate([np.arange(PARAMETERS) + PARAMETERS * image for image in group.images])
+        variances.append(
+            np.einsum("mka,ab,mkb->mk", jacobian, adjustment.covariance[np.ix_(columns, columns)], jacobian)
+        )
+    return rows, [*adjustment.control_weights, *adjustment.tie_weights], variances
 
 
 def correlations(adjustment: Adjustment, limit: float) -> list[list[dict[str, Any]]]:

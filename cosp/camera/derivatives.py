@@ -41,7 +41,8 @@ def film_derivatives(
     """
     p = camera.parameters()
     focal, sign = camera.focal_length_mm, camera.scan_direction
-    x = film_mm[:, 0]
+    imaged_mm = camera.imaged(film_mm)
+    x = imaged_mm[:, 0]
     tau = camera.scan_fraction(x)
     alpha = x / focal
     sine, cosine = np.sin(alpha), np.cos(alpha)
@@ -78,6 +79,8 @@ def film_derivatives(
     y_by_all[:, 12] -= sign * np.cos(p[6]) * focal * sine
 
     by_all = np.stack([x_by_all, y_by_all], axis=1)
+    if camera.film_field is not None:
+        by_all = by_all + camera.film_field.gradient(imaged_mm) @ by_all
     return by_all[:, :, :13], by_all[:, :, 13:]
 
 

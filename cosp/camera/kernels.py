@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from cosp.arrays import FloatArray
+from cosp.arrays import FloatArray, IntArray
 
 MAX_SCAN_ANGLE_RAD = math.radians(40.0)  # no lens of these cameras sweeps further
 
@@ -70,3 +70,139 @@ def project(
             film_mm[i, 0] = np.nan
             film_mm[i, 1] = np.nan
             x = 0.0
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _weights(x: float, half: float, knot: float, intervals: int, cubic: bool) -> tuple[int, float, float, float, float]:
+    """First spline and the values of the three or four uniform B-splines that are not zero at x."""
+    s = min(max((x + half) / knot, 0.0), float(intervals))
+    i = min(int(s), intervals - 1)
+    u = s - i
+    v = 1.0 - u
+    if cubic:
+        return (
+            i,
+            v * v * v / 6.0,
+            (u * u * (3.0 * u - 6.0) + 4.0) / 6.0,
+            (v * v * (3.0 * v - 6.0) + 4.0) / 6.0,
+            (u * u * u / 6.0),
+        )
+    return i, v * v / 2.0, 0.5 + u * v, u * u / 2.0, 0.0
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _displacement(
+    table: FloatArray, half_x: float, half_y: float, knot_x: float, knot_y: float, x: float, y: float
+) -> tuple[float, float]:
+    i, a0, a1, a2, a3 = _weights(x, half_x, knot_x, table.shape[0] - 3, True)
+    j, b0, b1, b2, _ = _weights(y, half_y, knot_y, table.shape[1] - 2, False)
+    dx = 0.0
+    dy = 0.0
+    for k in range(4):
+        a = a0 if k == 0 else a1 if k == 1 else a2 if k == 2 else a3
+        row = table[i + k]
+        dx += a * (b0 * row[j, 0] + b1 * row[j + 1, 0] + b2 * row[j + 2, 0])
+        dy += a * (b0 * row[j, 1] + b1 * row[j + 1, 1] + b2 * row[j + 2, 1])
+    return dx, dy
+
+
+@njit(nogil=True, cache=True)
+def distort(table: FloatArray, half_x: float, half_y: float, knot_x: float, knot_y: float, film_mm: FloatArray) -> None:
+    """Add the displacement of a film field to film points (N, 2), in place; NaN stays."""
+    for n in range(film_mm.shape[0]):
+        x, y = film_mm[n, 0], film_mm[n, 1]
+        if x == x and y == y:
+            dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, x, y)
+            film_mm[n, 0] = x + dx
+            film_mm[n, 1] = y + dy
+
+
+@njit(nogil=True, cache=True)
+def correct(table: FloatArray, half_x: float, half_y: float, knot_x: float, knot_y: float, film_mm: FloatArray) -> None:
+    """Undo `distort`, in place: a fixed point that gains three digits a step, for the field changes slowly."""
+    for n in range(film_mm.shape[0]):
+        measured_x, measured_y = film_mm[n, 0], film_mm[n, 1]
+        if measured_x == measured_x and measured_y == measured_y:
+            x, y = measured_x, measured_y
+            for _ in range(8):
+                dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, x, y)
+                change = abs(measured_x - dx - x) + abs(measured_y - dy - y)
+                x = measured_x - dx
+                y = measured_y - dy
+                if change < 1e-8:
+                    break
+            film_mm[n, 0] = x
+            film_mm[n, 1] = y
+
+
+@njit(nogil=True, cache=True)
+def splines_at(
+    along: int,
+    across: int,
+    half_x: float,
+    half_y: float,
+    knot_x: float,
+    knot_y: float,
+    film_mm: FloatArray,
+    splines: IntArray,
+    values: FloatArray,
+) -> None:
+    """Numbers (N, 12) and values (N, 12) of the splines that are not zero at film points (N, 2)."""
+    for n in range(film_mm.shape[0]):
+        x, y = film_mm[n, 0], film_mm[n, 1]
+        if not (x == x and y == y):
+            splines[n] = 0
+            values[n] = np.nan
+            continue
+        i, a0, a1, a2, a3 = _weights(x, half_x, knot_x, along - 3, True)
+        j, b0, b1, b2, _ = _weights(y, half_y, knot_y, across - 2, False)
+        for k in range(4):
+            a = a0 if k == 0 else a1 if k == 1 else a2 if k == 2 else a3
+            for m in range(3):
+                splines[n, 3 * k + m] = (i + k) * across + j + m
+                values[n, 3 * k + m] = a * (b0 if m == 0 else b1 if m == 1 else b2)
+
+
+@njit(nogil=True, cache=True)
+def field_gradient(
+    table: FloatArray,
+    half_x: float,
+    half_y: float,
+    knot_x: float,
+    knot_y: float,
+    film_mm: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Derivatives (N, 2, 2) of the displacement, component and direction, at film points (N, 2)."""
+    intervals_x, intervals_y = table.shape[0] - 3, table.shape[1] - 2
+    da = np.empty(4)
+    db = np.empty(3)
+    for n in range(film_mm.shape[0]):
+        x, y = film_mm[n, 0], film_mm[n, 1]
+        if not (x == x and y == y):
+            gradient[n] = np.nan
+            continue
+        i, a0, a1, a2, a3 = _weights(x, half_x, knot_x, intervals_x, True)
+        j, b0, b1, b2, _ = _weights(y, half_y, knot_y, intervals_y, False)
+        # Beyond its edge the field keeps its value.
+        scale_x = 1.0 / knot_x if abs(x) <= half_x else 0.0
+        scale_y = 1.0 / knot_y if abs(y) <= half_y else 0.0
+        u = min(max((x + half_x) / knot_x, 0.0), float(intervals_x)) - i
+        v = min(max((y + half_y) / knot_y, 0.0), float(intervals_y)) - j
+        da[0] = -0.5 * (1.0 - u) ** 2
+        da[1] = 1.5 * u * u - 2.0 * u
+        da[2] = 2.0 * (1.0 - u) - 1.5 * (1.0 - u) ** 2
+        da[3] = 0.5 * u * u
+        db[0] = v - 1.0
+        db[1] = 1.0 - 2.0 * v
+        db[2] = v
+        for c in range(2):
+            by_x = 0.0
+            by_y = 0.0
+            for k in range(4):
+                a = a0 if k == 0 else a1 if k == 1 else a2 if k == 2 else a3
+                row = table[i + k]
+                by_x += da[k] * (b0 * row[j, c] + b1 * row[j + 1, c] + b2 * row[j + 2, c])
+                by_y += a * (db[0] * row[j, c] + db[1] * row[j + 1, c] + db[2] * row[j + 2, c])
+            gradient[n, c, 0] = by_x * scale_x
+            gradient[n, c, 1] = by_y * scale_y

@@ -11,6 +11,7 @@ import numpy as np
 
 from cosp.arrays import FloatArray
 from cosp.camera import kernels
+from cosp.camera.field import FilmField
 from cosp.camera.missions import SCAN_DEG
 from cosp.geometry.frames import LocalFrame
 from cosp.geometry.rays import Rays
@@ -40,6 +41,9 @@ class PanoramicCamera:
         Omega, phi, kappa at mid-scan and their change over one scan.
     imc_factor : float
         V / (H delta) of image motion compensation by a moved lens.
+    film_field : FilmField or None
+        Distortion of this film: measured is imaged plus displacement. Added after a projection and taken off before a
+        ray is built, so that film points are measured ones everywhere outside.
 
     References
     ----------
@@ -60,6 +64,7 @@ class PanoramicCamera:
     angles_deg: Triple
     angles_change_deg: Triple
     imc_factor: float
+    film_field: FilmField | None = None
 
     @property
     def scan_length_mm(self) -> float:
@@ -106,6 +111,15 @@ class PanoramicCamera:
         size = self.scan_direction * self.imc_factor * self.focal_length_mm * math.cos(math.radians(self.angles_deg[0]))
         return np.asarray(size * np.sin(np.asarray(x_mm, float) / self.focal_length_mm))
 
+    def imaged(self, film_mm: FloatArray) -> FloatArray:
+        """Where the camera images film points (..., 2) in mm: measured ones without the distortion of the film."""
+        film_mm = np.asarray(film_mm, dtype=float)
+        return film_mm if self.film_field is None else self.film_field.corrected(film_mm)
+
+    def without_field(self) -> PanoramicCamera:
+        """The same camera on a film without distortion."""
+        return replace(self, film_field=None)
+
     def project(self, ground_m: FloatArray) -> FloatArray:
         """Film points (..., 2) in mm of ground points (..., 3) in the camera's local frame.
 
@@ -120,7 +134,7 @@ class PanoramicCamera:
             np.ascontiguousarray(ground_m.reshape(-1, 3)),
             film.reshape(-1, 2),
         )
-        return film
+        return film if self.film_field is None else self.film_field.distorted(film)
 
     def rays(self, film_mm: FloatArray) -> Rays:
         """Rays of film points (..., 2) in mm, in the camera's local frame.
@@ -129,8 +143,8 @@ class PanoramicCamera:
         ----------
         [Ghuffar2022] equation 9, solved for the direction.
         """
-        film_mm = np.asarray(film_mm, dtype=float)
-        x, y = film_mm[..., 0], film_mm[..., 1]
+        imaged_mm = self.imaged(film_mm)
+        x, y = imaged_mm[..., 0], imaged_mm[..., 1]
         tau = self.scan_fraction(x)[..., None]
         alpha = x / self.focal_length_mm
         in_camera = np.stack(
@@ -211,7 +225,8 @@ class PanoramicCamera:
         p[6:9], p[9:12] = ends[1], change
         # y_imc must change sign with y; sin(alpha) and the scan direction both do, cos(omega) does not.
         p[12] = -p[12]
-        return self.with_parameters(p, scan_direction=-self.scan_direction)
+        turned = self.with_parameters(p, scan_direction=-self.scan_direction)
+        return replace(turned, film_field=None if self.film_field is None else self.film_field.turned())
 
     def moved_to(self, origin: LocalFrame) -> PanoramicCamera:
         """The same camera described in another local frame."""

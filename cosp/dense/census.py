@@ -6,9 +6,10 @@ import logging
 from collections.abc import Callable
 from functools import cache
 
+import cv2
 import numpy as np
 
-from cosp.arrays import ByteArray
+from cosp.arrays import BoolArray, ByteArray
 from cosp.dense import kernels
 
 _log = logging.getLogger(__name__)
@@ -20,7 +21,8 @@ def left_census(image: ByteArray) -> ByteArray:
     Parameters
     ----------
     image : (rows, columns) array, contiguous
-        Grey values; 0 is no data, which becomes a pattern that is equally unlike everything.
+        Grey values; 0 is no data. Where the window reaches it, the pixel becomes a pattern that is equally unlike
+        everything: the edges of two films look like each other, wherever they lie on the ground.
 
     Returns
     -------
@@ -39,20 +41,31 @@ def right_census(image: ByteArray) -> ByteArray:
     return _census(image, kernels.RIGHT_BLANK)
 
 
+def lacks_data(image: ByteArray) -> BoolArray:
+    """Where the window of the census reaches no data (0)."""
+    if image.all():
+        return np.zeros(image.shape, np.bool_)
+    least = cv2.erode(image, np.ones((kernels.CENSUS_ROWS, kernels.CENSUS_COLUMNS), np.uint8))
+    return np.asarray(least == 0)
+
+
 def _census(image: ByteArray, blank: int) -> ByteArray:
     planes = np.empty((kernels.PLANES, *image.shape), np.uint8)
     wide_enough = image.shape[1] >= kernels.CENSUS_BLOCK + kernels.CENSUS_COLUMNS - 1
     transform = _transform() if wide_enough else kernels.census_plain
-    transform(image, planes, blank)
+    transform(image, planes)
+    missing = lacks_data(image)
+    if missing.any():
+        kernels.blank_census(planes, missing, blank)
     return planes
 
 
 @cache
-def _transform() -> Callable[[ByteArray, ByteArray, int], None]:
+def _transform() -> Callable[[ByteArray, ByteArray], None]:
     """The vector form where this machine's compiler takes it, else the plain loops."""
     try:
         image = np.zeros((8, 64), np.uint8)
-        kernels.census_vector(image, np.empty((kernels.PLANES, 8, 64), np.uint8), kernels.LEFT_BLANK)
+        kernels.census_vector(image, np.empty((kernels.PLANES, 8, 64), np.uint8))
     except Exception as error:  # whatever the compiler stumbles over, the loops give the same bits
         _log.warning("vector form of the census does not compile here, plain loops are used: %s", error)
         return kernels.census_plain

@@ -19,9 +19,9 @@ import numpy as np
 from cosp.arrays import BoolArray, ByteArray, Float32Array
 from cosp.dense.aggregation import aggregate_costs
 from cosp.dense.census import left_census, right_census
-from cosp.dense.resampling import SmoothField, fill_holes, median_of_given, picture_pyramid, prior_of, resample_right
+from cosp.dense.resampling import SmoothField, fill_holes, picture_pyramid, prior_of, resample_right
 from cosp.dense.selection import DisparityMap, select_disparities
-from cosp.dense.validity import Validity, correlation, no_data, picture_validity, speckles
+from cosp.dense.validity import Validity, ambiguous, correlation, doubly_claimed, no_data, picture_validity, speckles
 from cosp.imaging.windows import Window, tiles
 
 _log = logging.getLogger(__name__)
@@ -32,6 +32,9 @@ HALO_PX = 48
 
 STRIP_HALO_PX = 256
 """What a strip matched on its own must see of its neighbours: coarse levels look further."""
+
+BAND_ROWS = 512
+"""Whole rows taken at once where tiles will not do."""
 
 LEFT_OVER = 32
 """Disparities searched at the fine levels for what the level before did not know."""
@@ -95,6 +98,7 @@ def match(
     least_texture_sd: float,
     saturated_from: int,
     least_correlation: float,
+    least_uniqueness: float,
     largest_speckle_px: int,
     speckle_step_px: float,
     threads: int,
@@ -118,6 +122,9 @@ def match(
         Grey value from which film counts as saturated; a pixel is masked where most of the 9 x 9 px are.
     least_correlation : float
         Correlation of the pictures within 15 x 15 px, the disparity taken out, below which a pixel is masked.
+    least_uniqueness : float
+        Masked is where, in the mean of 15 x 15 px, the cheapest disparity is cheaper than all but its neighbours by
+        less than this share of their cost: no match stands out, as beyond the edge of the right picture.
     largest_speckle_px, speckle_step_px
         Islands of up to so many pixels, cut off by steps of more than so much, are masked.
     y_parallax : SmoothField, px
@@ -167,9 +174,7 @@ def match(
         _over_tiles(keep, coarse.shape, size, threads)
         found, level = coarse, step.level
 
-    result = DisparityMap(
-        np.empty(left.shape, np.float32), np.empty(left.shape, np.uint8), np.empty(left.shape, np.uint8)
-    )
+    result = DisparityMap(np.empty(left.shape, np.float32), *(np.empty(left.shape, np.uint8) for _ in range(3)))
     last = task_of(passes[-1])
 
     def finish(window: Window) -> None:
@@ -179,6 +184,7 @@ def match(
             grown,
             _matched(last, grown, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
             least_correlation=least_correlation,
+            least_uniqueness=least_uniqueness,
             largest_speckle_px=largest_speckle_px,
             speckle_step_px=speckle_step_px,
         )
@@ -186,15 +192,46 @@ def match(
         result.disparity[window.slices] = tile.disparity[inside]
         result.validity[window.slices] = tile.validity[inside]
         result.confidence[window.slices] = tile.confidence[inside]
+        result.similarity[window.slices] = tile.similarity[inside]
 
     _log.info("level 0: %d disparities", passes[-1].disparities)
     _over_tiles(finish, left.shape, tile_px, threads)
+    # Of whole rows, since the two that claim a pixel may lie tiles apart.
+    claimed = np.empty(left.shape, np.bool_)
+
+    def claim(window: Window) -> None:
+        band = window.grown(HALO_PX, left.shape)
+        lost = doubly_claimed(result.disparity[band.slices], result.confidence[band.slices], right.shape[1])
+        claimed[window.slices] = lost[window.inside(band).slices]
+
+    _over_tiles(claim, left.shape, (BAND_ROWS, left.shape[1]), threads)
+    _mask(result, claimed, Validity.INCONSISTENT)
+    if claimed.any():
+        left_over = np.empty(left.shape, np.bool_)
+
+        def clear(window: Window) -> None:
+            grown = window.grown(HALO_PX, left.shape)
+            islands = speckles(
+                result.disparity[grown.slices], largest_speckle_px=largest_speckle_px, speckle_step_px=speckle_step_px
+            )
+            left_over[window.slices] = islands[window.inside(grown).slices]
+
+        _over_tiles(clear, left.shape, tile_px, threads)
+        _mask(result, left_over, Validity.SPECKLE)
     return result
 
 
-def _over_tiles(work: Callable[[Window], None], shape: tuple[int, ...], tile_px: int, threads: int) -> None:
+def _mask(result: DisparityMap, where: BoolArray, reason: Validity) -> None:
+    """Take disparities out of a result, in place."""
+    result.disparity[where] = np.nan
+    result.validity[where] |= np.uint8(reason)
+
+
+def _over_tiles(
+    work: Callable[[Window], None], shape: tuple[int, ...], size: int | tuple[int, int], threads: int
+) -> None:
     """Do the work of every tile, so many at once; each writes to its own part of the result."""
-    windows = tiles((shape[0], shape[1]), tile_px)
+    windows = tiles((shape[0], shape[1]), size)
     cv2.setNumThreads(1)
     with ThreadPoolExecutor(threads) as pool:
         for done, _ in enumerate(pool.map(work, windows), start=1):
@@ -208,7 +245,8 @@ def _matched(
     left = np.ascontiguousarray(task.left[window.slices])
     if not left.any():
         outside = np.full(left.shape, int(Validity.NO_DATA_LEFT), np.uint8)
-        return DisparityMap(np.full(left.shape, np.nan, np.float32), outside, np.zeros_like(left))
+        nothing = np.zeros_like(left)
+        return DisparityMap(np.full(left.shape, np.nan, np.float32), outside, nothing, nothing)
     disparities = task.step.disparities
     margin = disparities // 2 + _SLACK_PX
     wide = Window(window.row0, window.row1, window.column0 - margin, window.column1 + margin)
@@ -249,36 +287,35 @@ def _cleaned(
     tile: DisparityMap,
     *,
     least_correlation: float,
+    least_uniqueness: float,
     largest_speckle_px: int,
     speckle_step_px: float,
 ) -> DisparityMap:
-    """Median of 5 x 5, what does not correlate and islands masked, disparities rounded."""
-    disparity = median_of_given(tile.disparity)
-    unlike = _unlike(task, window, disparity, least_correlation)
-    disparity[unlike] = np.nan
+    """Median of 5 x 5; what is not alike, what does not stand out and islands masked; disparities rounded."""
+    given = tile.validity == 0
+    if not given.any():
+        return tile
+    disparity = np.asarray(cv2.medianBlur(fill_holes(tile.disparity), 5), np.float32)
+    right = resample_right(
+        task.right, disparity, window.row0, window.column0, y_parallax=task.y_parallax, level=task.step.level
+    )
+    alike = correlation(task.left[window.slices], right)
+    unlike = given & (alike < least_correlation)
+    doubtful = given & ambiguous(tile.confidence, least_uniqueness)
+    disparity[~given | unlike | doubtful] = np.nan
     islands = speckles(disparity, largest_speckle_px=largest_speckle_px, speckle_step_px=speckle_step_px)
     disparity[islands] = np.nan
     np.rint(disparity * FRACTIONS, out=disparity)
     disparity /= FRACTIONS
-    validity = tile.validity | islands.view(np.uint8) * np.uint8(Validity.SPECKLE)
-    validity |= unlike.view(np.uint8) * np.uint8(Validity.LOW_CORRELATION)
-    return DisparityMap(disparity, validity, tile.confidence)
-
-
-def _unlike(task: _Task, window: Window, disparity: Float32Array, least_correlation: float) -> BoolArray:
-    """Where a disparity was found, but the pictures it brings together do not look alike."""
-    given = ~np.isnan(disparity)
-    if not given.any():
-        return given
-    right = resample_right(
-        task.right,
-        fill_holes(disparity),
-        window.row0,
-        window.column0,
-        y_parallax=task.y_parallax,
-        level=task.step.level,
-    )
-    return np.asarray(given & (correlation(task.left[window.slices], right) < least_correlation))
+    validity = tile.validity
+    for where, bit in (
+        (islands, Validity.SPECKLE),
+        (unlike, Validity.LOW_CORRELATION),
+        (doubtful, Validity.INCONSISTENT),
+    ):
+        validity |= where.view(np.uint8) * np.uint8(bit)
+    similarity = (255 * np.clip(alike, 0, 1)).astype(np.uint8)
+    return DisparityMap(disparity, validity, tile.confidence, similarity)
 
 
 def strip_alignment_px(span_px: float) -> int:

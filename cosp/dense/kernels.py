@@ -137,7 +137,7 @@ def _emit_paths(
 
 
 @intrinsic(prefer_literal=True)
-def _forward_pixel(
+def _carry_paths(
     _context: Any,
     count: Any,
     left: Any,
@@ -153,7 +153,7 @@ def _forward_pixel(
     small: Any,
     large: Any,
 ) -> Any:
-    """Costs and four forward paths of one pixel; the sum goes to `sums`. All but the steps are addresses."""
+    """Carry four paths over one pixel; their sum goes to `sums`. All but the steps are addresses."""
     disparities = count.literal_value
     signature = types.void(count, *([types.int64] * 10), types.uint8, types.uint8)
 
@@ -168,58 +168,27 @@ def _forward_pixel(
 
 
 @intrinsic(prefer_literal=True)
-def _backward_pixel(
+def _choose(
     _context: Any,
     count: Any,
-    left: Any,
-    left_plane: Any,
-    right: Any,
-    right_plane: Any,
-    beside: Any,
-    before_0: Any,
-    before_1: Any,
-    before_2: Any,
-    after: Any,
-    sums: Any,
-    totals: Any,
+    forward: Any,
+    backward: Any,
     masks: Any,
     right_costs: Any,
     right_indices: Any,
-    small: Any,
-    large: Any,
 ) -> Any:
-    """Costs and four backward paths of one pixel; returns winner + 65536 * cost of the runner-up.
+    """Winner + 65536 * cost of the runner-up at one pixel, whose `backward` sums become those of all eight paths.
 
-    Leaves all eight paths' sums in `totals` and lowers the costs of the right pixels that it could be matched with.
+    Lowers the costs of the right pixels that it could be matched with.
     """
     disparities = count.literal_value
-    signature = types.int64(count, *([types.int64] * 14), types.uint8, types.uint8)
+    signature = types.int64(count, *([types.int64] * 5))
 
     def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        (
-            _,
-            left,
-            left_plane,
-            right,
-            right_plane,
-            beside,
-            b0,
-            b1,
-            b2,
-            after,
-            sums,
-            totals,
-            masks,
-            rc,
-            ri,
-            small,
-            large,
-        ) = arguments
+        _, forward, backward, masks, right_costs, right_indices = arguments
         lanes = _Lanes(builder, disparities, 16)
-        costs = _emit_costs(builder, disparities, left, left_plane, right, right_plane)
-        backward = _emit_paths(builder, disparities, costs, beside, (b0, b1, b2), after, small, large)
-        total = builder.add(lanes.load(sums), backward)
-        lanes.store(total, totals)
+        total = builder.add(lanes.load(forward), lanes.load(backward))
+        lanes.store(total, backward)
         is_least = builder.icmp_unsigned("==", total, lanes.splat(lanes.least(total)))
         bits = ir.IntType(disparities)
         first_set = cgutils.get_or_insert_function(
@@ -230,10 +199,10 @@ def _backward_pixel(
             winner = builder.zext(winner, _I64)
         mask = lanes.load(builder.add(masks, builder.mul(_I64(2), builder.sub(_I64(disparities), winner))))
         runner_up = builder.zext(lanes.least(builder.or_(total, mask)), _I64)
-        old_costs, old_indices = lanes.load(rc), lanes.load(ri)
+        old_costs, old_indices = lanes.load(right_costs), lanes.load(right_indices)
         is_lower = builder.icmp_unsigned("<", total, old_costs)
-        lanes.store(lanes.lesser(total, old_costs), rc)
-        lanes.store(builder.select(is_lower, lanes.constant(range(disparities)), old_indices), ri)
+        lanes.store(lanes.lesser(total, old_costs), right_costs)
+        lanes.store(builder.select(is_lower, lanes.constant(range(disparities)), old_indices), right_indices)
         return builder.or_(winner, builder.shl(runner_up, _I64(16)))
 
     return signature, generate
@@ -269,31 +238,30 @@ def _census_block(_context: Any, source: Any, source_row: Any, target: Any, targ
 # --- census -----------------------------------------------------------------------------------------------------------
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _blank_plane(plane: int, blank: int) -> np.uint8:
-    """The blank pattern, cut to the bits that this plane really has."""
-    return np.uint8(blank & ((1 << min(8, CENSUS_BITS - 8 * plane)) - 1))
+@njit(nogil=True, cache=True)
+def _clear_frame(planes: Any) -> None:
+    """Zero where the window leaves the picture."""
+    _, rows, columns = planes.shape
+    planes[:, :HALF_ROWS] = 0
+    planes[:, max(rows - HALF_ROWS, 0) :] = 0
+    planes[:, :, :HALF_COLUMNS] = 0
+    planes[:, :, max(columns - HALF_COLUMNS, 0) :] = 0
 
 
 @njit(nogil=True, cache=True)
-def _frame_and_blank(image: Any, planes: Any, blank: int) -> None:
-    """Zero where the window leaves the picture, the blank pattern where there is no data."""
-    rows, columns = image.shape
+def blank_census(planes: Any, missing: Any, blank: int) -> None:
+    """Put the blank pattern, cut to the bits that each plane really has, where data are missing."""
+    _, rows, columns = planes.shape
     for plane in range(PLANES):
-        pattern = _blank_plane(plane, blank)
+        pattern = np.uint8(blank & ((1 << min(8, CENSUS_BITS - 8 * plane)) - 1))
         for row in range(rows):
-            if row < HALF_ROWS or row >= rows - HALF_ROWS:
-                planes[plane, row] = 0
-            else:
-                planes[plane, row, :HALF_COLUMNS] = 0
-                planes[plane, row, columns - HALF_COLUMNS :] = 0
             for column in range(columns):
-                if image[row, column] == 0:
+                if missing[row, column]:
                     planes[plane, row, column] = pattern
 
 
 @njit(nogil=True, cache=True)
-def census_vector(image: Any, planes: Any, blank: int) -> None:
+def census_vector(image: Any, planes: Any) -> None:
     """Census of a picture of at least CENSUS_BLOCK + 8 columns into planes (PLANES, rows, columns)."""
     rows, columns = image.shape
     source, target = image.ctypes.data, planes.ctypes.data
@@ -304,11 +272,11 @@ def census_vector(image: Any, planes: Any, blank: int) -> None:
             place = row * columns + min(column, last)
             _census_block(source + place, columns, target + place, rows * columns)
             column += CENSUS_BLOCK
-    _frame_and_blank(image, planes, blank)
+    _clear_frame(planes)
 
 
 @njit(nogil=True, cache=True)
-def census_plain(image: Any, planes: Any, blank: int) -> None:
+def census_plain(image: Any, planes: Any) -> None:
     """The same as `census_vector` in plain loops, for pictures of any size."""
     rows, columns = image.shape
     for row in range(HALF_ROWS, rows - HALF_ROWS):
@@ -325,7 +293,7 @@ def census_plain(image: Any, planes: Any, blank: int) -> None:
                     if bit % 8 == 0 or bit == CENSUS_BITS:
                         planes[(bit - 1) // 8, row, column] = code
                         code = 0
-    _frame_and_blank(image, planes, blank)
+    _clear_frame(planes)
 
 
 # --- semi-global passes -----------------------------------------------------------------------------------------------
@@ -364,8 +332,8 @@ def vector_passes(disparities: int) -> Callable[..., None]:
     ) -> None:
         _, rows, columns = left_planes.shape
         right_columns = right_planes.shape[2]
-        states = np.zeros((2, columns + 2, 3 * disparities), np.uint8)
-        beside = np.zeros(disparities, np.uint8)
+        states = np.empty((2, columns + 2, 3 * disparities), np.uint8)
+        beside = np.empty(disparities, np.uint8)
         totals = np.full(disparities + 2, UNKNOWN_COST, np.uint16)
         masks = np.zeros(2 * disparities + 1, np.uint16)
         masks[disparities - 1 : disparities + 2] = UNKNOWN_COST
@@ -373,73 +341,56 @@ def vector_passes(disparities: int) -> Callable[..., None]:
         right_indices = np.empty(columns + disparities, np.uint16)
         left_address, right_address = left_planes.ctypes.data, right_planes.ctypes.data
         states_address, beside_address, volume_address = states.ctypes.data, beside.ctypes.data, volume.ctypes.data
-        totals_address, masks_address = totals.ctypes.data, masks.ctypes.data
+        totals_address, masks_address = totals.ctypes.data + 2, masks.ctypes.data
         right_costs_address, right_indices_address = right_costs.ctypes.data, right_indices.ctypes.data
         small, large = np.uint8(small_step), np.uint8(large_step)
-        stride = 3 * disparities
-        line = (columns + 2) * stride
+        entry = 3 * disparities
+        line = (columns + 2) * entry
         for sweep in range(2):
             step = 1 - 2 * sweep
             states[:] = 0
             for i in range(rows):
                 row = i if sweep == 0 else rows - 1 - i
                 beside[:] = 0
-                if sweep == 1:
-                    right_costs[:] = UNKNOWN_COST
-                    right_indices[:] = 0
+                right_costs[:] = UNKNOWN_COST
+                right_indices[:] = 0
                 last = states_address + (i & 1) * line
                 this = states_address + (1 - (i & 1)) * line
                 for j in range(columns):
                     column = j if sweep == 0 else columns - 1 - j
-                    left = left_address + row * columns + column
-                    right = right_address + row * right_columns + offset + column
-                    state = (column + 1) * stride
-                    before_0 = last + state - step * stride
-                    before_1 = last + state + disparities
-                    before_2 = last + state + 2 * disparities + step * stride
+                    state = (column + 1) * entry
                     sums = volume_address + (row * columns + column) * 2 * disparities
+                    _carry_paths(
+                        disparities,
+                        left_address + row * columns + column,
+                        rows * columns,
+                        right_address + row * right_columns + offset + column,
+                        rows * right_columns,
+                        beside_address,
+                        last + state - step * entry,
+                        last + state + disparities,
+                        last + state + 2 * disparities + step * entry,
+                        this + state,
+                        sums if sweep == 0 else totals_address,
+                        small,
+                        large,
+                    )
                     if sweep == 0:
-                        _forward_pixel(
-                            disparities,
-                            left,
-                            rows * columns,
-                            right,
-                            rows * right_columns,
-                            beside_address,
-                            before_0,
-                            before_1,
-                            before_2,
-                            this + state,
-                            sums,
-                            small,
-                            large,
-                        )
-                    else:
-                        found = _backward_pixel(
-                            disparities,
-                            left,
-                            rows * columns,
-                            right,
-                            rows * right_columns,
-                            beside_address,
-                            before_0,
-                            before_1,
-                            before_2,
-                            this + state,
-                            sums,
-                            totals_address + 2,
-                            masks_address,
-                            right_costs_address + 2 * column,
-                            right_indices_address + 2 * column,
-                            small,
-                            large,
-                        )
-                        winner = found & 0xFFFF
-                        winners[row, column] = winner
-                        costs[row, column, 0] = totals[winner]
-                        costs[row, column, 1] = totals[winner + 1]
-                        costs[row, column, 2] = totals[winner + 2]
-                        costs[row, column, 3] = found >> 16
+                        continue
+                    found = _choose(
+                        disparities,
+                        sums,
+                        totals_address,
+                        masks_address,
+                        right_costs_address + 2 * column,
+                        right_indices_address + 2 * column,
+                    )
+                    winner = found & 0xFFFF
+                    winners[row, column] = winner
+                    costs[row, column, BELOW] = totals[winner]
+                    costs[row, column, BEST] = totals[winner + 1]
+                    costs[row, column, ABOVE] = totals[winner + 2]
+                    costs[row, column, RUNNER_UP] = found >> 16
                 if sweep == 1:
                     for j in range(columns + disparities):
                         right_winners[row, j] = right_indices[j]
@@ -650,6 +601,60 @@ def _add_line(line: Any, sign: int, saturated_from: int, sums: Any, squares: Any
 
 
 @njit(nogil=True, cache=True)
+def correlate_windows(left: Any, right: Any, half: int, least_variance: float, found: Any) -> None:
+    """Normalised correlation of two pictures in the windows of 2 half + 1 pixels a side about every pixel.
+
+    Windows are cut at the picture's edges. Grey values are counted from mid-grey, so that integers of 32 bits hold
+    windows of up to 15 pixels a side exactly. least_variance: geometric mean of the variances from which it counts.
+    """
+    rows, columns = left.shape
+    sums = np.zeros((5, columns + 2 * half), np.int32)  # down the window's height, with nothing beside the picture
+    totals = np.empty((5, columns), np.int32)
+    widths = np.empty(columns, np.int32)
+    for column in range(columns):
+        widths[column] = min(column + half, columns - 1) - max(column - half, 0) + 1
+    least = np.float32(least_variance * least_variance)
+    for row in range(-half, rows):
+        if row + half < rows:
+            _add_products(left[row + half], right[row + half], np.int32(1), sums[:, half:])
+        if row - half - 1 >= 0:
+            _add_products(left[row - half - 1], right[row - half - 1], np.int32(-1), sums[:, half:])
+        if row < 0:
+            continue
+        for i in range(5):
+            line, total = sums[i], np.int32(0)
+            for column in range(2 * half):
+                total = np.int32(total + line[column])
+            for column in range(columns):
+                total = np.int32(total + line[column + 2 * half])
+                totals[i, column] = total
+                total = np.int32(total - line[column])
+        height = np.int32(min(row + half, rows - 1) - max(row - half, 0) + 1)
+        a, b, aa, bb, ab = totals[0], totals[1], totals[2], totals[3], totals[4]
+        for column in range(columns):
+            size = np.int32(height * widths[column])
+            covariance = np.int32(np.int32(size * ab[column]) - np.int32(a[column] * b[column]))  # size^2 times it
+            one = np.int32(np.int32(size * aa[column]) - np.int32(a[column] * a[column]))
+            other = np.int32(np.int32(size * bb[column]) - np.int32(b[column] * b[column]))
+            area = np.float32(np.int32(size * size))
+            variances = max(np.float32(one) * np.float32(other), least * area * area)
+            found[row, column] = np.float32(covariance) / np.sqrt(variances)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _add_products(left: Any, right: Any, sign: int, sums: Any) -> None:
+    """Add (or take away) a line of grey values, their squares and their products."""
+    for column in range(len(left)):
+        a = np.int32(np.int32(left[column]) - np.int32(128))
+        b = np.int32(np.int32(right[column]) - np.int32(128))
+        sums[0, column] += np.int32(sign * a)
+        sums[1, column] += np.int32(sign * b)
+        sums[2, column] += np.int32(sign * np.int32(a * a))
+        sums[3, column] += np.int32(sign * np.int32(b * b))
+        sums[4, column] += np.int32(sign * np.int32(a * b))
+
+
+@njit(nogil=True, cache=True)
 def _root(parents: Any, run: int) -> int:
     """Representative of the island that a run belongs to; shortens the way there."""
     while parents[run] != run:
@@ -799,3 +804,37 @@ def fill_from(values: Any, coarse: Any) -> None:
             values[row, column] = (one - v) * ((one - u) * coarse[top, left] + u * coarse[top, right]) + v * (
                 (one - u) * coarse[bottom, left] + u * coarse[bottom, right]
             )
+
+
+@njit(nogil=True, cache=True)
+def claim_columns(disparity: Any, support: Any, width: int, apart: int, lost: Any) -> None:
+    """Mark matches whose right pixel is better matched with a left pixel that lies elsewhere.
+
+    disparity : (rows, columns), NaN where there is none
+    support : (rows, columns) uint8, the weight of each claim
+    width : columns of the right picture
+    apart : two left pixels at most so far apart may share a right one, as foreshortened slopes do
+    lost : (rows, columns) bool, filled
+    """
+    rows, columns = disparity.shape
+    best = np.empty(width + 2, np.uint8)
+    claimant = np.empty(width + 2, np.int64)
+    for row in range(rows):
+        best[:] = 0
+        for column in range(columns):
+            value = disparity[row, column]
+            lost[row, column] = False
+            if np.isnan(value):
+                continue
+            place = int(np.rint(column + value)) + 1
+            if 0 < place <= width and support[row, column] > best[place]:
+                best[place] = support[row, column]
+                claimant[place] = column
+        for column in range(columns):
+            value = disparity[row, column]
+            if np.isnan(value):
+                continue
+            place = min(max(int(np.rint(column + value)) + 1, 1), width)
+            for near in range(place - 1, place + 2):
+                if best[near] > support[row, column] and abs(claimant[near] - column) > apart:
+                    lost[row, column] = True

@@ -14,16 +14,18 @@ from cosp.dense.validity import Validity
 
 @dataclass(frozen=True)
 class DisparityMap:
-    """Disparity of every left pixel, why it is missing, and how far ahead of the others it was.
+    """Disparity of every left pixel, why it is missing, and how sure it is.
 
     disparity : (rows, columns) array, px; right column = left column + disparity; NaN where validity is not 0
     validity : (rows, columns) array of `Validity` bits
     confidence : (rows, columns) array, 0 (the runner-up costs the same) to 255 (the runner-up costs infinitely more)
+    similarity : (rows, columns) array, 0 (none) to 255 (full correlation of the pictures about the pixel)
     """
 
     disparity: Float32Array
     validity: ByteArray
     confidence: ByteArray
+    similarity: ByteArray
 
 
 def select_disparities(
@@ -43,7 +45,9 @@ def select_disparities(
         Bits that the pictures alone decide.
     """
     shape = found.winners.shape
-    result = DisparityMap(np.empty(shape, np.float32), left_validity.copy(), np.empty(shape, np.uint8))
+    result = DisparityMap(
+        np.empty(shape, np.float32), left_validity.copy(), np.empty(shape, np.uint8), np.zeros(shape, np.uint8)
+    )
     kernels.select(
         found.winners,
         found.costs,

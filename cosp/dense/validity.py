@@ -10,6 +10,7 @@ import numpy as np
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from cosp.dense import kernels
+from cosp.dense.census import lacks_data
 from cosp.geometry.statistics import summarise
 
 CORRELATION_WINDOW_PX = 15
@@ -19,12 +20,23 @@ TEXTURE_WINDOW_PX = 9
 """Side of the window in which texture is measured: the census looks as far."""
 
 
+CLAIM_WINDOW_PX = 31
+"""Side of the window whose confident matches support a claim to a pixel of the right picture."""
+
+SHARED_PX = 8
+"""Left pixels this close may share a right pixel: a slope seen almost from the side."""
+
+
+NARROWEST_TEXTURE_PX = 13
+"""Texture narrower than this, measured in windows, comes from a line of two or three px, such as a scratch."""
+
+
 class Validity(IntFlag):
     """Why a pixel has no disparity; 0 where it has one."""
 
-    NO_DATA_LEFT = 1
+    NO_DATA_LEFT = 1  # within the window of the census
     NO_DATA_RIGHT = 2  # the match lies outside the right picture
-    INCONSISTENT = 4  # the right picture prefers another match: occluded, or ambiguous
+    INCONSISTENT = 4  # the right picture prefers another match: occluded; or others are as good
     LOW_TEXTURE = 8
     SATURATED = 16
     AT_RANGE_EDGE = 32  # the cheapest disparity was the first or last that was searched
@@ -33,8 +45,8 @@ class Validity(IntFlag):
 
 
 def no_data(image: ByteArray, flag: Validity) -> ByteArray:
-    """`flag` where the picture is 0."""
-    bits: ByteArray = (image == 0).view(np.uint8) * np.uint8(flag)
+    """`flag` where the picture is 0 within the window of the census, which would see the film's edge there."""
+    bits: ByteArray = lacks_data(image).view(np.uint8) * np.uint8(flag)
     return bits
 
 
@@ -44,7 +56,8 @@ def picture_validity(
     """Bits that one picture decides alone.
 
     LOW_TEXTURE where the grey values of the surrounding window scatter by less than `least_texture_sd` (standard
-    deviation), SATURATED where most of them are at least `saturated_from`, and the flag given where the picture is 0.
+    deviation), and where that is more only along a line, as in a scratch over snow or water: each film has its own.
+    SATURATED where most are at least `saturated_from`, and the flag given where the window of the census meets a 0.
     """
     bits = no_data(image, no_data_flag)
     kernels.flag_windows(
@@ -56,7 +69,9 @@ def picture_validity(
         int(Validity.SATURATED),
         bits,
     )
-    return bits
+    around = np.ones((NARROWEST_TEXTURE_PX, NARROWEST_TEXTURE_PX), np.uint8)
+    flat = bits & np.uint8(Validity.LOW_TEXTURE)
+    return bits | np.asarray(cv2.morphologyEx(flat, cv2.MORPH_CLOSE, around), np.uint8)
 
 
 def correlation(left: ByteArray, right: ByteArray) -> Float32Array:
@@ -64,17 +79,21 @@ def correlation(left: ByteArray, right: ByteArray) -> Float32Array:
 
     Grain and noise of two films have nothing in common, so this tells texture from what only looks like it.
     """
-    size = (CORRELATION_WINDOW_PX, CORRELATION_WINDOW_PX)
-    first, second = left.astype(np.float32), right.astype(np.float32)
-
-    def mean(values: Float32Array) -> Float32Array:
-        return np.asarray(cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_REFLECT), np.float32)
-
-    first_mean, second_mean = mean(first), mean(second)
-    covariance = mean(first * second) - first_mean * second_mean
-    variances = (mean(first * first) - first_mean**2) * (mean(second * second) - second_mean**2)
+    found = np.empty(left.shape, np.float32)
     # A variance of a quarter grey value squared is the rounding of a flat picture.
-    return np.asarray(covariance / np.sqrt(np.maximum(variances, 0.0625)), np.float32)
+    kernels.correlate_windows(left, right, CORRELATION_WINDOW_PX // 2, 0.25, found)
+    return found
+
+
+def ambiguous(confidence: ByteArray, least_uniqueness: float) -> BoolArray:
+    """Where the mean confidence of the window about a pixel is too low: that of one pixel is noise.
+
+    least_uniqueness : float
+        Share of the cost by which the best match is cheaper than the runner-up.
+    """
+    size = (CORRELATION_WINDOW_PX, CORRELATION_WINDOW_PX)
+    mean = cv2.boxFilter(confidence, -1, size, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(mean < 255 * least_uniqueness)
 
 
 def speckles(disparity: Float32Array, *, largest_speckle_px: int, speckle_step_px: float) -> BoolArray:
@@ -85,6 +104,29 @@ def speckles(disparity: Float32Array, *, largest_speckle_px: int, speckle_step_p
     found = np.empty(disparity.shape, np.bool_)
     kernels.islands(disparity, speckle_step_px, largest_speckle_px, found)
     return found
+
+
+def doubly_claimed(disparity: Float32Array, confidence: ByteArray, right_columns: int) -> BoolArray:
+    """Where another match, better supported around it, has the same pixel of the right picture.
+
+    What only the left picture shows, beyond the edge of the right one above all, finds matches too: random ones, in
+    patches. The pixels they take belong to others.
+
+    Parameters
+    ----------
+    disparity : (rows, columns) array, px
+        NaN where there is none.
+    confidence : (rows, columns) array
+    right_columns : int
+        Width of the right picture.
+    """
+    given = np.where(np.isnan(disparity), np.uint8(0), confidence)
+    size = (CLAIM_WINDOW_PX, CLAIM_WINDOW_PX)
+    # In whole numbers, so that a strip and the whole picture round alike.
+    support = cv2.boxFilter(given, -1, size, borderType=cv2.BORDER_CONSTANT)
+    lost = np.empty(disparity.shape, np.bool_)
+    kernels.claim_columns(disparity, support, right_columns, SHARED_PX, lost)
+    return lost
 
 
 def summarise_disparity(validity_counts: IntArray, disparity_px: FloatArray) -> dict[str, Any]:

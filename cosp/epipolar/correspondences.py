@@ -8,7 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosp.arrays import BoolArray, FloatArray
+from cosp.epipolar.polynomials import Basis
 from cosp.errors import NoOverlapError
+from cosp.geometry.robust import tukey_weights
+
+_ROBUST_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,45 @@ def virtual_conjugates(
         fore_directions,
         aft_directions,
     )
+
+
+def measured_conjugates(fore_mm: FloatArray, aft_mm: FloatArray, *, degree: int) -> ConjugatePoints:
+    """Conjugate points from tie points alone, for films without cameras.
+
+    A smooth map from one film to the other leaves what relief does to each point, and that lies along the epipolar
+    direction. Whether ground is high or low is not known, but it is either on both films.
+
+    Parameters
+    ----------
+    fore_mm, aft_mm : (N, 2) arrays, mm
+        Some may be wrong.
+    degree : int
+        Total degree of the smooth map.
+    """
+    on_aft = _residuals_of_map(fore_mm, aft_mm, degree)
+    on_fore = _residuals_of_map(aft_mm, fore_mm, degree)
+    # The larger half, without the largest: the one is noise, the other is wrong.
+    size = np.linalg.norm(on_aft, axis=-1)
+    clear = (size > np.quantile(size, 0.5)) & (size < np.quantile(size, 0.95))
+    doubled = ((on_aft[clear, 0] + 1j * on_aft[clear, 1]) ** 2).sum()
+    axis = np.sqrt(doubled / np.abs(doubled))
+    rises = np.sign(on_aft[clear] @ [axis.real, axis.imag])[:, None]
+    directions = (rises * a[clear] / np.linalg.norm(a[clear], axis=-1, keepdims=True) for a in (on_fore, on_aft))
+    return ConjugatePoints(fore_mm, aft_mm, np.full(len(fore_mm), np.nan), *directions)
+
+
+def _residuals_of_map(source_mm: FloatArray, target_mm: FloatArray, degree: int) -> FloatArray:
+    """Target points minus those of the smooth map from source to target that most of them follow, (N, 2) mm."""
+    basis = Basis(degree, degree, total=True)
+    scale = np.abs(source_mm).max(axis=0)
+    design = basis.design(*(source_mm / scale).T)
+    root = np.ones(len(source_mm))
+    for _ in range(_ROBUST_STEPS):
+        solution, *_ = np.linalg.lstsq(design * root[:, None], target_mm * root[:, None], rcond=None)
+        residuals = target_mm - design @ solution
+        size = np.linalg.norm(residuals, axis=-1)
+        root = np.sqrt(tukey_weights(size / (1.4826 * np.median(size))))
+    return np.asarray(residuals)
 
 
 def _transfer(

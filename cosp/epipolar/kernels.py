@@ -1,4 +1,4 @@
-"""The compiled loops: polynomials of many points, and film points of the pixels of a rectified image."""
+"""The compiled loops: polynomials and splines of many points, film points of the pixels of a rectified image."""
 
 from __future__ import annotations
 
@@ -140,3 +140,60 @@ def _collect(
             b += powers[i, j] * change[j]
         value[i] = a
         slope[i] = b * row_scale[1]
+
+
+@njit(nogil=True, cache=True)
+def move_rows(
+    coefficients: FloatArray,
+    row_scale: tuple[float, float],
+    column_scale: tuple[float, float],
+    rows: FloatArray,
+    columns: FloatArray,
+    moved: FloatArray,
+) -> None:
+    """Rows plus the value of a cubic B-spline at (row, column).
+
+    coefficients : (R + 2, C + 2), of a lattice of R x C nodes and one ring about it; beyond the lattice the values of
+        its edge go on.
+    row_scale, column_scale : (place in the lattice of row or column 0, change per row or column).
+    rows : (H, W), or (H, 1) where a line is on one row
+    columns, moved : (H, W)
+    """
+    last_r = coefficients.shape[0] - 3
+    last_c = coefficients.shape[1] - 3
+    line = np.empty(last_c + 3)
+    collected = np.nan
+    for y in range(columns.shape[0]):
+        for x in range(columns.shape[1]):
+            row = rows[y, x if rows.shape[1] > 1 else 0]
+            q = column_scale[0] + column_scale[1] * columns[y, x]
+            p = row_scale[0] + row_scale[1] * row
+            if np.isnan(p + q):
+                moved[y, x] = np.nan
+                continue
+            q = min(max(q, 0.0), float(last_c))
+            j = min(int(q), last_c - 1)
+            if row != collected:
+                p = min(max(p, 0.0), float(last_r))
+                i = min(int(p), last_r - 1)
+                a, b, c, d = _spline_weights(p - i)
+                # The whole line where it serves the next pixels too, else what this one needs.
+                first, stop = (0, last_c + 3) if rows.shape[1] == 1 else (j, j + 4)
+                for k in range(first, stop):
+                    line[k] = (
+                        a * coefficients[i, k]
+                        + b * coefficients[i + 1, k]
+                        + c * coefficients[i + 2, k]
+                        + d * coefficients[i + 3, k]
+                    )
+                if rows.shape[1] == 1:
+                    collected = row
+            a, b, c, d = _spline_weights(q - j)
+            moved[y, x] = row + (a * line[j] + b * line[j + 1] + c * line[j + 2] + d * line[j + 3])
+
+
+@njit(nogil=True, cache=True)
+def _spline_weights(t: float) -> tuple[float, float, float, float]:
+    """Weights of the four coefficients about a place that lies a part t after the second of them."""
+    s = 1.0 - t
+    return s * s * s / 6.0, 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - s * s * (1.0 - 0.5 * s), t * t * t / 6.0

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosp.arrays import ByteArray, FloatArray
+from cosp.arrays import FloatArray
+from cosp.epipolar.correction import RowCorrection, correction_field
+from cosp.epipolar.patches import Patches
+from cosp.epipolar.rectification import Rectification
 from cosp.epipolar.smoothing import local_median, smooth_field
 from cosp.errors import NotEnoughMatchesError
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.statistics import nmad
 from cosp.imaging.correlation import ncc_surfaces, subpixel_peaks
-from cosp.imaging.resampling import block_mean
-from cosp.imaging.windows import Window
 
 _log = logging.getLogger(__name__)
 
-Reader = Callable[[Window], ByteArray]
 # Columns of the coarsest search, in its own pixels: the pyramid is as high as this asks for.
 _COARSEST_SPAN_PX = 48
 # From one level to the next a disparity may be wrong by so many pixels of the new level: a slope of the terrain between
@@ -91,9 +90,8 @@ def node_grid(shape: tuple[int, int], *, spacing_px: int, fewest_nodes: int) -> 
 
 
 def measure_y_parallax(
-    read_fore: Reader,
-    read_aft: Reader,
-    shape: tuple[int, int],
+    fore: Patches,
+    aft: Patches,
     nodes: PixelGrid,
     disparity_bounds: tuple[FloatArray, FloatArray],
     *,
@@ -111,9 +109,8 @@ def measure_y_parallax(
 
     Parameters
     ----------
-    read_fore, read_aft : function
-        Grey values of a window of the rectified images; 0 outside the film.
-    shape : (rows, columns) of both images
+    fore, aft : Patches
+        Windows of the rectified images; 0 outside the film.
     nodes : PixelGrid
         Of the nodes in pixels of the fore image.
     disparity_bounds : (lowest, highest), arrays of the nodes' shape, px
@@ -140,9 +137,7 @@ def measure_y_parallax(
     search = (_ROW_SEARCH_PX, math.ceil(span / 2 / factor) + 2)
     while True:
         _log.info("correlating %d x %d nodes at 1 : %d", *nodes.shape, factor)
-        measured = _correlate(
-            read_fore, read_aft, shape, nodes, (y_parallax, disparity), factor, search, template_px, threads
-        )
+        measured = _correlate(fore, aft, nodes, (y_parallax, disparity), factor, search, template_px, threads)
         good = (measured.score >= least_score) & (measured.ratio <= largest_ratio)
         found = np.where(good, measured.disparity_px, np.nan)
         odd = np.abs(found - local_median(found, _MEDIAN_RADIUS)) > _ODD_PX * factor + _ODD_SLOPE * nodes.step_x
@@ -155,15 +150,46 @@ def measure_y_parallax(
             )
         if factor == 1:
             break
-        found = np.where(good, measured.disparity_px, np.nan)
-        disparity = np.where(np.isfinite(low), _filled(local_median(found, 1)), np.nan)
-        found = np.where(good, measured.y_parallax_px, np.nan)
-        y_parallax = np.where(np.isfinite(low), _filled(local_median(found, _MEDIAN_RADIUS)), np.nan)
+        disparity, y_parallax = (
+            np.where(np.isfinite(low), _filled(local_median(np.where(good, values, np.nan), radius)), np.nan)
+            for values, radius in ((measured.disparity_px, 1), (measured.y_parallax_px, _MEDIAN_RADIUS))
+        )
         factor //= 2
         search = (_ROW_SEARCH_PX, _COLUMN_SEARCH_PX)
     raw = np.where(good, measured.y_parallax_px, np.nan)
     smooth = smooth_field(raw, np.where(good, measured.score**2, 0.0), sigma_nodes=smoothing_nodes)
     return YParallax(nodes, raw, smooth, measured.score, np.where(good, measured.disparity_px, np.nan))
+
+
+def fold_y_parallax(rectification: Rectification, found: YParallax, *, smoothing_nodes: float) -> Rectification:
+    """The rectification with a smooth field of measured y-parallax taken out of the rows of its aft image.
+
+    The field belongs to the place on the aft image, and is drawn there. What distorts one film and what distorts the
+    other go together only as far as disparity is small beside the length over which they change, which it is.
+
+    Parameters
+    ----------
+    rectification : Rectification
+        Without a correction so far: it is what `found` was measured with.
+    found : YParallax
+    smoothing_nodes : float
+        Standard deviation of the smoothing window, in nodes.
+    """
+    measured = np.isfinite(found.raw_px)
+    place = found.grid.centres()[measured]
+    field = correction_field(
+        place[:, 1],
+        place[:, 0] + found.disparity_px[measured],
+        found.raw_px[measured],
+        found.score[measured] ** 2,
+        found.grid,
+        smoothing_nodes=smoothing_nodes,
+    )
+    aft = rectification.aft
+    correction = RowCorrection.through(
+        field, found.grid, pixel_mm=aft.pixel_mm, row0_mm=aft.row0_mm, column0_mm=aft.column0_mm
+    )
+    return replace(rectification, aft=replace(aft, correction=correction))
 
 
 @dataclass(frozen=True)
@@ -183,9 +209,8 @@ def _filled(values: FloatArray) -> NDArray[np.float64]:
 
 
 def _correlate(
-    read_fore: Reader,
-    read_aft: Reader,
-    shape: tuple[int, int],
+    fore: Patches,
+    aft: Patches,
     nodes: PixelGrid,
     expected: tuple[FloatArray, FloatArray],
     factor: int,
@@ -200,7 +225,7 @@ def _correlate(
     def one(strip: slice) -> _Measured:
         part = nodes.window(strip.start, strip.stop, 0, nodes.shape[1])
         guess = (expected[0][strip], expected[1][strip])
-        return _correlate_strip(read_fore, read_aft, shape, part, guess, factor, search, template_px)
+        return _correlate_strip(fore, aft, part, guess, factor, search, template_px)
 
     with ThreadPoolExecutor(threads) as pool:
         parts = list(pool.map(one, strips))
@@ -213,9 +238,8 @@ def _correlate(
 
 
 def _correlate_strip(
-    read_fore: Reader,
-    read_aft: Reader,
-    shape: tuple[int, int],
+    fore: Patches,
+    aft: Patches,
     nodes: PixelGrid,
     expected: tuple[FloatArray, FloatArray],
     factor: int,
@@ -237,8 +261,8 @@ def _correlate_strip(
     aft_row, aft_column = row + aside_row - search[0], column + aside_column - search[1]
     aft_shape = (template_px + 2 * search[0], template_px + 2 * search[1])
 
-    templates = _patches(read_fore, shape, row[usable], column[usable], (template_px, template_px), factor)
-    searches = _patches(read_aft, shape, aft_row[usable], aft_column[usable], aft_shape, factor)
+    templates = fore(row[usable], column[usable], (template_px, template_px), factor)
+    searches = aft(aft_row[usable], aft_column[usable], aft_shape, factor)
     lit = (templates == 0).mean(axis=(1, 2)) <= _MOST_BLACK
     shift, score, ratio = subpixel_peaks(ncc_surfaces(templates[lit], searches[lit]))
     rows, columns = (index[lit] for index in np.nonzero(usable))
@@ -247,24 +271,3 @@ def _correlate_strip(
     result.score[rows, columns] = score
     result.ratio[rows, columns] = ratio
     return result
-
-
-def _patches(
-    read: Reader,
-    shape: tuple[int, int],
-    row: NDArray[np.intp],
-    column: NDArray[np.intp],
-    size: tuple[int, int],
-    factor: int,
-) -> NDArray[np.float32]:
-    """Patches of one size of the image reduced by a factor, 0 outside it, (N, h, w); rows and columns are the first."""
-    window = Window(int(row.min()), int(row.max()) + size[0], int(column.min()), int(column.max()) + size[1])
-    full = Window(*(factor * edge for edge in (window.row0, window.row1, window.column0, window.column1)))
-    inside = full.grown(0, shape)
-    picture = np.zeros(full.shape, np.uint8)
-    if min(inside.shape) > 0:
-        picture[inside.inside(full).slices] = read(inside)
-    reduced = block_mean(picture, factor)
-    rows = (row - window.row0)[:, None, None] + np.arange(size[0])[:, None]
-    columns = (column - window.column0)[:, None, None] + np.arange(size[1])
-    return np.asarray(reduced[rows, columns], np.float32)

@@ -11,17 +11,22 @@ from numpy.polynomial import chebyshev
 
 from cosp.arrays import Float32Array, FloatArray
 from cosp.epipolar import kernels
+from cosp.epipolar.correction import RowCorrection
 from cosp.epipolar.correspondences import ConjugatePoints, FilmMapping
 from cosp.epipolar.directions import common_directions_rad
 from cosp.epipolar.polynomials import Basis, Fit, evaluate, fit, fit_quality, fit_row_functions
 from cosp.errors import NoOverlapError
 from cosp.geometry.grids import PixelGrid
+from cosp.geometry.robust import tukey_weights
 from cosp.imaging.windows import Window
 
 # Polynomials are trusted this far beyond the conjugate points they were fitted to, as a part of half their range.
 _BEYOND = 0.02
 # The inverse needs more terms than the polynomial it inverts; so many give 1e-4 px on whole films.
 _INVERSE_MORE = (3, 5)
+# The correction of rows changes by less than a hundredth of a pixel per pixel: each step gains two digits or more.
+_CORRECTION_STEPS = 4
+_ROBUST_STEPS = 6
 # Nodes a side at which the extent of a window on the film is looked up.
 _LATTICE = 33
 # Terms of disparity at a given height as a function of the place on the fore film.
@@ -33,7 +38,8 @@ class EpipolarMap:
     """One film and its rectified image.
 
     The film's frame is turned about its centre: u along the epipolar direction, v across it, to the right of it. The
-    row coordinate is a polynomial of both, the column coordinate is u.
+    row coordinate is a polynomial of both, the column coordinate is u. What was measured to be left across the rows may
+    be taken out by a correction.
 
     Parameters
     ----------
@@ -52,6 +58,9 @@ class EpipolarMap:
     pixel_mm : float
     row0_mm, column0_mm : float
         Row coordinate and u of the centre of pixel (0, 0).
+    correction : RowCorrection, optional
+        The place (row coordinate, u) of the image shows what the polynomials put that much further along the rows'
+        coordinate.
     """
 
     direction_deg: float
@@ -65,6 +74,7 @@ class EpipolarMap:
     pixel_mm: float
     row0_mm: float
     column0_mm: float
+    correction: RowCorrection | None = None
 
     @property
     def _axes(self) -> FloatArray:
@@ -85,6 +95,10 @@ class EpipolarMap:
         with np.errstate(invalid="ignore"):
             scaled_row = (row_mm - self.row_centre_mm) / self.row_half_mm
             known = (np.abs(u) <= 1 + _BEYOND) & (np.abs(scaled_row) <= 1 + _BEYOND)
+        if self.correction is not None:
+            uncorrected = rows
+            for _ in range(_CORRECTION_STEPS):
+                rows = rows + uncorrected - self._uncorrected_rows(rows, columns)
         return np.where(known, rows, np.nan), np.where(known, columns, np.nan)
 
     def film(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
@@ -135,6 +149,14 @@ class EpipolarMap:
         self._to_plane(rows, columns, affine, -1e6, film_columns, film_rows)
         return film_rows, film_columns
 
+    def _uncorrected_rows(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """The rows at which the polynomials alone put what places of the image show."""
+        if self.correction is None:
+            return rows
+        return self.correction.move(
+            rows, columns, pixel_mm=self.pixel_mm, row0_mm=self.row0_mm, column0_mm=self.column0_mm
+        )
+
     def _film_affine(self) -> FloatArray:
         """(2, 3) film coordinates of (scaled u, scaled v, 1)."""
         scaled = self._axes * np.array([self.half_u_mm, self.half_v_mm])
@@ -144,10 +166,11 @@ class EpipolarMap:
         self, rows: FloatArray, columns: FloatArray, affine: FloatArray, outside: float, first: Any, second: Any
     ) -> None:
         """Fill two (H, W) arrays with the places of pixels in the plane that the affine leads to."""
+        columns = np.broadcast_to(columns, first.shape)
         kernels.pixels_to_plane(
             np.apply_along_axis(_powers, 0, self.inverse / self.half_v_mm),
-            rows,
-            np.broadcast_to(columns, first.shape),
+            self._uncorrected_rows(rows, columns),
+            columns,
             ((self.row0_mm - self.row_centre_mm) / self.row_half_mm, self.pixel_mm / self.row_half_mm),
             (self.column0_mm / self.half_u_mm, self.pixel_mm / self.half_u_mm),
             1 + _BEYOND,
@@ -171,7 +194,7 @@ class Rectification:
         On the same rows; columns are placed so that disparities lie about zero.
     shape : (rows, columns)
     heights_m : (low, high)
-        Ellipsoidal heights the disparities were worked out for.
+        Ellipsoidal heights the disparities were worked out for; NaN where no camera says.
     disparity_low, disparity_high : (4, 10) arrays, px
         Chebyshev coefficients of the disparity at the lower and at the upper height over the fore film (scaled u, v).
     disparity_shift_px : int
@@ -325,6 +348,8 @@ def fit_rectification(
 ) -> Rectification:
     """Rectification of the whole overlap of two films from conjugate points.
 
+    Virtual points, made of cameras, are fitted as they are; measured ones, whose heights are NaN, robustly.
+
     Parameters
     ----------
     conjugates : ConjugatePoints
@@ -354,9 +379,16 @@ def fit_rectification(
         half_u, half_v = np.abs(uv - centre).max(axis=0)
         halves.append((float(half_u), float(half_v)))
 
+    measured = bool(np.isnan(conjugates.height_m).all())
     *polynomials, residuals = fit_row_functions(uvs[0], uvs[1], halves[0], halves[1], basis)
-    model = fit_quality(residuals / pixel_mm)
+    good = np.full(len(residuals), True)
+    for _ in range(_ROBUST_STEPS if measured else 0):
+        weights = tukey_weights(residuals / (1.4826 * float(np.median(np.abs(residuals)))))
+        good = weights > 0
+        *polynomials, residuals = fit_row_functions(uvs[0], uvs[1], halves[0], halves[1], basis, np.sqrt(weights))
+    model = fit_quality(residuals[good] / pixel_mm)
 
+    uvs = [uv[good] for uv in uvs]
     rows_mm = evaluate(polynomials[0], uvs[0][:, 0] / halves[0][0], uvs[0][:, 1] / halves[0][1])
     row_low, row_high = float(rows_mm.min()), float(rows_mm.max())
     disparity_mm = uvs[1][:, 0] - uvs[0][:, 0]
@@ -386,13 +418,21 @@ def fit_rectification(
             )
         )
 
-    heights = np.unique(conjugates.height_m)
     disparity_px = (disparity_mm - aft_ahead) / pixel_mm
-    surfaces = []
-    for height in (heights[0], heights[-1]):
-        chosen = conjugates.height_m == height
-        u, v = uvs[0][chosen, 0] / halves[0][0], uvs[0][chosen, 1] / halves[0][1]
-        surfaces.append(fit(_DISPARITY_BASIS, u, v, disparity_px[chosen])[0])
+    u, v = (uvs[0] / halves[0]).T
+    if measured:
+        heights = np.full(2, np.nan)
+        middle, _ = fit(_DISPARITY_BASIS, u, v, disparity_px)
+        about = disparity_px - evaluate(middle, u, v)
+        surfaces = [middle.copy(), middle.copy()]
+        for surface, end in zip(surfaces, (about.min(), about.max()), strict=True):
+            surface[0, 0] += end
+    else:
+        heights = np.unique(conjugates.height_m)
+        surfaces = []
+        for height in (heights[0], heights[-1]):
+            chosen = conjugates.height_m == height
+            surfaces.append(fit(_DISPARITY_BASIS, u[chosen], v[chosen], disparity_px[chosen])[0])
     return Rectification(
         fore=maps[0],
         aft=maps[1],

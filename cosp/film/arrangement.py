@@ -24,6 +24,10 @@ class Pose:
     mirrored: bool = False
 
 
+_Placed = tuple[int, Pose]
+_Chain = tuple[_Placed, ...]
+
+
 @dataclass(frozen=True)
 class Arrangement:
     """Parts from left to right.
@@ -100,50 +104,61 @@ def arrange(
     Raises
     ------
     StitchingError
-        Where a seam stays in doubt; it is named, with what was found and needed.
+        Where two parts are the same picture, or a seam stays in doubt; the files are named, with what was found and
+        what is needed.
     """
+    for k, first in enumerate(parts):
+        for j in range(k):
+            if np.array_equal(first, parts[j]):
+                raise StitchingError(f"{names[j]} and {names[k]} are the same picture; each part is needed once")
     if len(parts) == 1:
         return Arrangement((0,), (Pose(),), (), float("inf"))
     evidence = _Evidence(parts, pixel_mm=pixel_mm, limits=limits, rng=rng)
-    plain = tuple(Pose() for _ in parts)
-    given = tuple(range(len(parts)))
-    for order in (given, given[::-1]):
-        seams = [evidence.seam(left, right) for left, right in itertools.pairwise(zip(order, plain, strict=True))]
+    plain = tuple((i, Pose()) for i in range(len(parts)))
+    for chain in (plain, plain[::-1]):
+        seams = evidence.seams(chain)
+        doubtful = [seam for seam in seams if not limits.accepts(seam)]
+        # One overlap may be nearly blank: more pixels show what it has.
+        if len(doubtful) == 1 < len(seams):
+            seams = evidence.closer_seams(chain)
         if all(limits.accepts(seam) for seam in seams):
-            return _arrangement(order, plain, seams)
+            return _arrangement(chain, seams)
     _LOG.info("the order of the parts as given leaves a seam in doubt; comparing all orders, turns and mirrors")
-    order, poses = _best_chain(evidence, len(parts))
-    seams = [evidence.seam(left, right) for left, right in itertools.pairwise(zip(order, poses, strict=True))]
+    best: tuple[int, _Chain, list[CoarseSeam | None]] | None = None
+    for chain in _best_chains(evidence, len(parts), slack=float(np.log1p(limits.min_features))):
+        seams = evidence.closer_seams(chain)
+        agreeing = min(seam.inliers if limits.accepts(seam) and seam is not None else -1 for seam in seams)
+        if best is None or agreeing > best[0]:
+            best = agreeing, chain, seams
+    assert best is not None
+    _, chain, seams = best
     for k, seam in enumerate(seams):
         if not limits.accepts(seam):
-            # More pixels show what a nearly blank overlap has.
-            seam = evidence.closer((order[k], poses[k]), (order[k + 1], poses[k + 1]))
-            seams[k] = seam
-        if not limits.accepts(seam):
-            found = (
-                "no plausible motion" if seam is None else f"{seam.inliers} agreeing keypoints against {seam.rivals}"
-            )
+            found = "no shift that keypoints agree on"
+            if seam is not None:
+                found = f"{seam.inliers} agreeing keypoints against {seam.rivals} of the best other shift"
             raise StitchingError(
-                f"seam {names[order[k]]} - {names[order[k + 1]]}: {found} of the best other shift; "
+                f"seam {names[chain[k][0]]} - {names[chain[k + 1][0]]}: {found}; "
                 f"{limits.min_features} and a margin of {limits.min_margin:g} are needed. "
                 "The parts may not belong to one film, one may be missing or given twice, or the overlap is blank"
             )
-    return _arrangement(order, poses, seams)
+    return _arrangement(chain, seams)
 
 
-def _arrangement(order: Sequence[int], poses: Sequence[Pose], seams: Sequence[CoarseSeam | None]) -> Arrangement:
+def _arrangement(chain: _Chain, seams: Sequence[CoarseSeam | None]) -> Arrangement:
     sure = tuple(seam for seam in seams if seam is not None)
-    return Arrangement(tuple(order), tuple(poses), sure, min(_margin(seam) for seam in sure))
+    margin = min(_margin(seam) for seam in sure)
+    return Arrangement(tuple(i for i, _ in chain), tuple(pose for _, pose in chain), sure, margin)
 
 
 def _margin(seam: CoarseSeam) -> float:
     return seam.inliers / max(seam.rivals, 1)
 
 
-_Placed = tuple[int, Pose]
-_Chain = tuple[_Placed, ...]
 # Keypoints per part while all orders and poses are compared.
 _SKETCH_KEYPOINTS = 3000
+# Two pieces of film can be joined in eight ways.
+_MOST_CHAINS = 12
 
 
 class _Evidence:
@@ -173,6 +188,19 @@ class _Evidence:
         if (left, right) not in self._seams:
             self._seams[left, right] = self._match(left, right, self._factor)
         return self._seams[left, right]
+
+    def seams(self, chain: _Chain) -> list[CoarseSeam | None]:
+        """The seams of parts laid side by side."""
+        return [self.seam(left, right) for left, right in itertools.pairwise(chain)]
+
+    def closer_seams(self, chain: _Chain) -> list[CoarseSeam | None]:
+        """The seams of parts laid side by side; one that is in doubt is looked at closer, two show a wrong chain."""
+        seams = self.seams(chain)
+        doubtful = [k for k, seam in enumerate(seams) if not self._limits.accepts(seam)]
+        if len(doubtful) == 1:
+            k = doubtful[0]
+            seams[k] = self.closer(chain[k], chain[k + 1])
+        return seams
 
     def sketch(self, left: _Placed, right: _Placed) -> CoarseSeam | None:
         """The seam from the strongest keypoints only."""
@@ -207,8 +235,12 @@ class _Evidence:
         )
 
 
-def _best_chain(evidence: _Evidence, count: int) -> tuple[tuple[int, ...], tuple[Pose, ...]]:
-    """Order and poses whose seams have most agreeing keypoints, as little changed as possible."""
+def _best_chains(evidence: _Evidence, count: int, *, slack: float) -> list[_Chain]:
+    """Chains whose seams have most agreeing keypoints, the best first, each as little changed as possible.
+
+    A chain that lacks no more than `slack` of the best sum stays: where one overlap is nearly blank, the two pieces
+    that it joins can lie in several ways. Of chains that look alike only one is returned.
+    """
     poses = [Pose(turned, mirrored) for mirrored in (False, True) for turned in (False, True)]
     totals: dict[_Chain, float] = {}
     for order in itertools.permutations(range(count)):
@@ -219,12 +251,17 @@ def _best_chain(evidence: _Evidence, count: int) -> tuple[tuple[int, ...], tuple
                 seam = evidence.sketch(*min(_same((left, right))))
                 total += 0.0 if seam is None else float(np.log1p(max(seam.inliers - seam.rivals, 0)))
             totals[chain] = total
-    best = max(totals, key=lambda chain: totals[chain])
-    chain = min(
-        _same(best),
-        key=lambda same: (sum(p.mirrored for _, p in same), sum(p.turned for _, p in same), [i for i, _ in same]),
-    )
-    return tuple(i for i, _ in chain), tuple(p for _, p in chain)
+    enough = max(totals.values()) - slack
+    kept: dict[_Chain, float] = {}
+    for chain, total in totals.items():
+        if total >= enough:
+            kept[min(_same(chain), key=_changes)] = total
+    return sorted(kept, key=lambda chain: -kept[chain])[:_MOST_CHAINS]
+
+
+def _changes(chain: _Chain) -> tuple[int, int, list[int]]:
+    """How much a chain changes: parts mirrored, parts turned, and their order."""
+    return sum(p.mirrored for _, p in chain), sum(p.turned for _, p in chain), [i for i, _ in chain]
 
 
 def _same(chain: _Chain) -> list[_Chain]:

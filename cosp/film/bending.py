@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -11,14 +11,18 @@ from scipy.interpolate import make_smoothing_spline
 
 from cosp.arrays import ByteArray, FloatArray
 from cosp.film.exposure import Exposure
-from cosp.film.stripes import Trace
+from cosp.film.joining import Layout, view
+from cosp.film.stripes import Trace, robust_trend
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.robust import tukey_weights
 from cosp.geometry.statistics import nmad
-from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 
 _LEAST_SCALE_MM = 0.005
+_DISTANCE_DEGREE = 2
+_WEIGHT_OF_TREND = 0.01
+_LARGEST_OPENING_MM = 0.25
+_LEAST_GATE_MM = 0.05
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,15 @@ class Bending:
         bottom = np.interp(x, self.x_mm, self.dy_bottom_mm)
         share = (y - self.y_bottom_mm) / (self.y_top_mm - self.y_bottom_mm)
         return np.stack([x, y + bottom + share * (top - bottom)], axis=-1)
+
+    def straight(self, xy_mm: FloatArray) -> FloatArray:
+        """Where points (..., 2) of the film as it was scanned lie on the straight film, mm: the inverse of `bent`."""
+        xy_mm = np.asarray(xy_mm, float)
+        x, y = xy_mm[..., 0], xy_mm[..., 1]
+        top = np.interp(x, self.x_mm, self.dy_top_mm)
+        bottom = np.interp(x, self.x_mm, self.dy_bottom_mm)
+        opening = (top - bottom) / (self.y_top_mm - self.y_bottom_mm)
+        return np.stack([x, (y - bottom + opening * self.y_bottom_mm) / (1.0 + opening)], axis=-1)
 
 
 def no_bending(exposure: Exposure, *, sd_mm: float) -> Bending:
@@ -129,8 +142,10 @@ def bending_from_traces(
 ) -> Bending:
     """Smooth curves through the traces of one or two lines.
 
-    Tilt stays in the curves, so that both lines come out along the film's axis; so does the mean, where there are two
-    lines: the axis lies midway between them. With one line alone the other side is given the same curve.
+    The line that is seen more carries the other one: of that, only its distance from the first is smoothed, so that a
+    gap is bridged by the bend of the other side and not by a guess. Tilt stays in the curves, so that both lines come
+    out along the film's axis; so does the mean, where there are two lines: the axis lies midway between them. With one
+    line alone the other side is given the same curve.
 
     Parameters
     ----------
@@ -148,8 +163,14 @@ def bending_from_traces(
     low = min(float(trace.x_mm[0]) for trace in traces)
     high = max(float(trace.x_mm[-1]) for trace in traces)
     x = np.linspace(low, high, max(2, round((high - low) / step_mm) + 1))
-    fits = [_smooth(trace, x, smoothing_mm) for trace in traces]
-    (curve_top, sd_top), (curve_bottom, sd_bottom) = fits if len(fits) == 2 else fits * 2
+    carrier = max(traces, key=lambda trace: trace.share)
+    spline, sd_carrier = _smooth(carrier, smoothing_mm)
+    fits = {carrier.side: (spline(x), sd_carrier)}
+    for other in traces:
+        if other is not carrier:
+            rest, sd_rest = _distance_smooth(other.raised(-spline(other.x_mm)), smoothing_mm)
+            fits[other.side] = (spline(x) + rest(x), sd_rest)
+    (curve_top, sd_top), (curve_bottom, sd_bottom) = (fits.get(side, fits[carrier.side]) for side in ("top", "bottom"))
     mean_top, mean_bottom = float(curve_top.mean()), float(curve_bottom.mean())
     sd = float(np.hypot(sd_top, sd_bottom) / np.sqrt(2.0))
     if len(traces) == 1:
@@ -167,24 +188,59 @@ def bending_from_traces(
     )
 
 
-def _smooth(trace: Trace, x_mm: FloatArray, smoothing_mm: float) -> tuple[FloatArray, float]:
-    """Curve at `x_mm` and its standard deviation; gaps are bridged, ends continued straight."""
-    x, y = trace.x_mm[trace.seen], trace.y_mm[trace.seen]
+def _distance_smooth(distance: Trace, smoothing_mm: float) -> tuple[Callable[[FloatArray], FloatArray], float]:
+    """As `_smooth`, of the distance of two lines: it hardly changes along the film, which tells what is no line.
+
+    Far from places seen it returns to its own trend, which a spline with nothing to hold it would not.
+    """
+    seen = distance.seen
+    if seen.sum() < 4 * _DISTANCE_DEGREE:
+        return _smooth(distance, smoothing_mm)
+    u = np.interp(distance.x_mm, distance.x_mm[[0, -1]], [-1.0, 1.0])
+    # Whole stretches of a scratch or of rail holes can stand in for a line; they would draw a polynomial to them.
+    level = np.nanmedian(distance.y_mm)
+    likely = np.where(np.abs(distance.y_mm - level) < _LARGEST_OPENING_MM, distance.y_mm, np.nan)
+    trend = robust_trend(u, likely, _DISTANCE_DEGREE, at=u)
+    off = distance.y_mm - trend
+    y = np.where(np.abs(off) <= max(_LEAST_GATE_MM, 5.0 * nmad(off)), off, np.nan)
+    curve, sd = _smooth(replace(distance, y_mm=y), smoothing_mm, unseen=_WEIGHT_OF_TREND)
+    # Where the line is not seen, its distance may differ from the trend as it does where it is.
+    sd = float(np.hypot(sd, np.sqrt(1.0 - np.isfinite(y).mean()) * nmad(y)))
+    return lambda x_mm: curve(x_mm) + np.interp(x_mm, distance.x_mm, trend), sd
+
+
+def _smooth(
+    trace: Trace, smoothing_mm: float, *, unseen: float = 0.0
+) -> tuple[Callable[[FloatArray], FloatArray], float]:
+    """Curve through a trace and its standard deviation; gaps are bridged, ends continued straight.
+
+    `unseen` is the weight with which places that were not seen draw the curve to zero.
+    """
+    used = trace.seen | (unseen > 0)
+    x, y = trace.x_mm[used], np.nan_to_num(trace.y_mm[used])
+    base = np.where(trace.seen[used], 1.0, unseen)
     centre = float(x.mean())
     # The penalised spline damps waves of angular frequency k by 1 / (1 + lam k^4 spacing): half at this wavelength.
     spacing = float(np.median(np.diff(x)))
     lam = (smoothing_mm / (2 * np.pi)) ** 4 / spacing
-    weights = np.ones_like(x)
+    weights = base
     for _ in range(4):
         spline = make_smoothing_spline(x - centre, y, w=np.maximum(weights, 1e-3), lam=lam)
         residual = y - spline(x - centre)
         # Traces come without gross errors, and a good one is far closer to the film than a stiff curve can follow:
         # what the curve misses must not be taken for an error of the trace.
-        scale = max(nmad(residual), _LEAST_SCALE_MM)
-        weights = tukey_weights(residual / scale)
-    # Places within half a wavelength share one value of the curve.
-    independent = max(1.0, smoothing_mm / 2 / spacing * trace.share)
-    return np.asarray(spline(x_mm - centre)), float(scale / np.sqrt(independent))
+        scale = max(nmad(residual[base == 1.0]), _LEAST_SCALE_MM)
+        weights = base * np.where(base == 1.0, tukey_weights(residual / scale), 1.0)
+    # Places within half a wavelength share one value of the curve; an edge is rough in pieces longer than the spacing,
+    # and neighbours that err alike count as fewer.
+    rough = np.clip(residual[base == 1.0], -3 * scale, 3 * scale)
+    alike = float(np.clip((rough[1:] @ rough[:-1]) / max(rough @ rough, 1e-12), 0.0, 0.95))
+    independent = max(1.0, smoothing_mm / 2 / spacing * trace.share * (1 - alike) / (1 + alike))
+
+    def curve(x_mm: FloatArray) -> FloatArray:
+        return np.asarray(spline(np.asarray(x_mm) - centre))
+
+    return curve, float(scale / np.sqrt(independent))
 
 
 def film_grid(exposure: Exposure, *, half_length_mm: float, half_width_mm: float) -> PixelGrid:
@@ -205,23 +261,9 @@ def joined_pixels(
     return exposure.pixels(bending.bent(-xy_mm if turned else xy_mm))
 
 
-def joined_window(
-    grid: PixelGrid, window: Window, exposure: Exposure, bending: Bending, shape: tuple[int, int], *, turned: bool
-) -> Window:
-    """Window of the joined film (of the given shape) that a window of the straight film is made from."""
-    lattice_rows = np.unique(np.linspace(window.row0, window.row1 - 1, 9).round())
-    lattice_columns = np.unique(np.linspace(window.column0, window.column1 - 1, 65).round())
-    points = grid.points(lattice_rows[:, None], lattice_columns[None, :])
-    rows, columns = joined_pixels(points, exposure, bending, turned=turned)
-    # Bicubic needs two pixels; the curves bend by far less than two more between lattice points.
-    row0, column0 = (int(np.clip(v.min() - 5, 0, n - 1)) for v, n in zip((rows, columns), shape, strict=True))
-    row1, column1 = (int(np.clip(v.max() + 6, 1, n)) for v, n in zip((rows, columns), shape, strict=True))
-    return Window(row0, max(row1, row0 + 1), column0, max(column1, column0 + 1))
-
-
 def straighten(
-    image: ByteArray,
-    source: Window,
+    parts: Sequence[ByteArray],
+    layout: Layout,
     grid: PixelGrid,
     window: Window,
     exposure: Exposure,
@@ -229,13 +271,13 @@ def straighten(
     *,
     turned: bool,
 ) -> ByteArray:
-    """A window of the straight film, resampled once (bicubic) from a window of the joined film; 0 outside.
+    """A window of the straight film, resampled once (bicubic) from the parts; 0 outside.
 
     Parameters
     ----------
-    image : array of the shape of `source`
-    source : Window
-        Of the joined film, see `joined_window`.
+    parts : (rows, columns) uint8 array of each place of the layout
+    layout : Layout
+        Of the joined film.
     grid : PixelGrid
         Of the straight film.
     window : Window
@@ -246,10 +288,7 @@ def straighten(
     """
     # For each column of the straight film the place is linear along the column: two of its points give the others.
     columns_here = np.arange(window.column0, window.column1)
-    first, last = (grid.points(np.array(row), columns_here) for row in (window.row0, window.row1 - 1))
-    begin, end = (joined_pixels(points, exposure, bending, turned=turned) for points in (first, last))
-    share = np.linspace(0.0, 1.0, window.row1 - window.row0, dtype=np.float32)[:, None]
-    places = []
-    for start, stop, offset in zip(begin, end, (source.row0, source.column0), strict=True):
-        places.append((start - offset).astype(np.float32) + share * (stop - start).astype(np.float32))
-    return np.asarray(sample(image, places[0], places[1], interpolation="cubic"), np.uint8)
+    ends = [grid.points(np.array(row), columns_here) for row in (window.row0, window.row1 - 1)]
+    places = [joined_pixels(points, exposure, bending, turned=turned) for points in ends]
+    begin, end = (np.stack([columns, rows], axis=-1) for rows, columns in places)
+    return view(parts, layout, begin, end, window.row1 - window.row0)

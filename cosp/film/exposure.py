@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import binary_opening, gaussian_filter1d
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from cosp.errors import InputError
@@ -64,6 +64,9 @@ _FULL_STEP = 40.0
 _TILT_LIMIT_DEG = 1.0
 # Lines thinner than this are no picture; stripes are a tenth of a millimetre and lie 0.6 mm and more beside it.
 LINE_MM = 0.55
+# Fewer bright columns than this are a scratch, a mark or the border of the scan.
+_PICTURE_MM = 8.0
+_BARE_MM = 5.0  # of film beyond the format at least
 
 
 def find_exposure(
@@ -246,12 +249,8 @@ def _short_sides(
     strength = np.sign(along) * np.sqrt(np.abs(along))
     # An end is a step at every row: the mean over rows of the clipped step; texture inside the picture averages out.
     profile = gaussian_filter1d(strength.mean(axis=0), 0.7)
-    # The film beyond an end is dark and even; the picture inside an end is not both.
-    level = upright.astype(np.float32)
-    spread = gaussian_filter1d(np.abs(np.diff(level, axis=1, prepend=level[:, :1])).mean(axis=0), 3.0 / step_mm)
     low, high = (int(length_mm * (1 + sign * tolerance) / step_mm) for sign in (-1, 1))
     high = min(high, columns - 1)
-    del spread
     best = (-np.inf, 0.0, 0.0)
     nominal = length_mm / step_mm
     for distance in range(low, high + 1):
@@ -268,12 +267,28 @@ def _short_sides(
     ends = [_refine_end(profile, best[1]), _refine_end(-profile, best[2])]
     seen = (ends[0][1] > 1.5, ends[1][1] > 1.5)
     left, right = ends[0][0], ends[1][0]
-    if seen[0] and not seen[1]:
-        right = left + nominal
-    elif seen[1] and not seen[0]:
-        left = right - nominal
-    sd = {2: 0.3, 1: 0.25 * tolerance * nominal, 0: tolerance * nominal}[sum(seen)]
-    return left, right, seen, float(sd)
+    if all(seen):
+        return left, right, seen, 0.3
+    # The dark side of a picture that ends in the night looks like the end of the format. The format must hold the
+    # picture that is seen, and lie on the film that was scanned.
+    scanned = np.flatnonzero(valid.mean(axis=0) > 0.9)
+    grey = np.median(upright[:, scanned], axis=0)
+    # Parts differ in brightness by a few grey levels: film without a picture is what each end of the scan shows.
+    end = max(2, round(_BARE_MM / step_mm))
+    dark = np.linspace(np.median(grey[:end]), np.median(grey[-end:]), len(grey))
+    bright = grey > dark + 6.0
+    shown = scanned[binary_opening(bright, np.ones(max(2, round(_PICTURE_MM / step_mm)), bool))]
+    earliest = max(shown[-1] - nominal if shown.size else 0.0, float(scanned[0]))
+    latest = min(float(shown[0]) if shown.size else np.inf, scanned[-1] - nominal)
+    slack = tolerance * nominal
+    if earliest > latest:  # something bright beside the film: it bounds nothing
+        earliest, latest = -np.inf, np.inf
+    spread = (latest - earliest) / np.sqrt(12.0) if np.isfinite(latest) else 0.0
+    for k, place in enumerate((left, right - nominal)):
+        if seen[k] and earliest - slack / 4 <= place <= latest + slack / 4:
+            return place, place + nominal, seen, float(max(slack / 4, spread))
+    middle = (earliest + latest) / 2 if np.isfinite(latest) else (left + right - nominal) / 2
+    return middle, middle + nominal, (False, False), float(max(slack, spread))
 
 
 def _refine_end(profile: FloatArray, column: float) -> tuple[float, float]:

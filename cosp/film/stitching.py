@@ -1,4 +1,4 @@
-"""Rigid motion of each seam between digitised parts, and the parts joined on one grid.
+"""Rigid motion of each seam between digitised parts.
 
 A part is a (rows, columns) uint8 array; parts overlap along the film (columns). Places in a part and in the joined film
 are points (x, y) = (column, row) in pixels, pixel centres on integers.
@@ -7,14 +7,13 @@ are points (x, y) = (column, row) in pixels, pixel centres on integers.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from cosp.arrays import ByteArray, Float32Array, FloatArray
+from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from cosp.errors import InputError, StitchingError
 from cosp.geometry.robust import tukey_weights
 from cosp.geometry.statistics import nmad
@@ -33,7 +32,7 @@ _ROTATION_LIMIT_DEG = 1.2
 _SEARCH_PX = (12, 5, 3)
 _PATCHES = 600
 # Farther than this from the common motion a patch is a blunder (dust, scratches, repeated pattern).
-_GATE_PX = 1.5
+GATE_PX = 1.5
 _RESIDUALS_KEPT = 250
 
 
@@ -48,6 +47,10 @@ class Features:
     def strongest(self, count: int | None) -> Features:
         """The first `count` of them; all for None."""
         return Features(self.xy[:count], self.angle_deg[:count], self.descriptors[:count])
+
+    def where(self, chosen: BoolArray) -> Features:
+        """Those of a mask (N,)."""
+        return Features(self.xy[chosen], self.angle_deg[chosen], self.descriptors[chosen])
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ class Seam:
     patches, inliers : int
         Patches correlated, and those the motion is made from.
     rms_px, check_rms_px : float
-        Residuals (per coordinate) of the inliers; of every second one against a motion from the others.
+        Residuals (per coordinate) of the inliers; of one half of them against a motion from the other half.
     overlap_px : int
         Width of the overlap.
     residuals : (N, 4) array
@@ -158,6 +161,9 @@ def match_features(
         Largest ratio of the distances to the nearest and the second nearest descriptor.
     rng : numpy Generator
     """
+    # Comparing all with all is dear: only what can lie in the overlap is looked at.
+    reach = overlap_px[1] + gate_px
+    left, right = left.where(left.xy[:, 0] > left_width_px - reach), right.where(right.xy[:, 0] < reach)
     source, target = _mutual_matches(left, right, ratio=ratio)
     shift = target - source
     overlap = left_width_px - shift[:, 0]
@@ -218,7 +224,7 @@ def refine_seam(
     motion = coarse.motion
     for search_px in _SEARCH_PX:
         size, points = _lattice(left.shape, right.shape, motion)
-        found = _correlate(left, right, motion, points, size=size, search_px=search_px, threads=threads)
+        found = correlate_patches(left, right, motion, points, size=(size, size), search_px=search_px, threads=threads)
         shift, score, ratio = found
         good = (score > min_score) & (ratio < 0.95) & np.isfinite(shift).all(axis=1)
         # Patch of the left part at p looks like the right part at motion^-1(p + shift).
@@ -229,7 +235,7 @@ def refine_seam(
             source,
             target,
             minimum=2,
-            gate=_GATE_PX if search_px < _SEARCH_PX[0] else 2 * _GATE_PX,
+            gate=GATE_PX if search_px < _SEARCH_PX[0] else 2 * GATE_PX,
             trials=300,
             rng=rng,
         )
@@ -239,12 +245,14 @@ def refine_seam(
                 f"one motion; {min_inliers} are needed"
             )
         source, target = source[inliers], target[inliers]
-        motion = _robust_rigid(source, target, estimate)
+        motion = robust_rigid(source, target, estimate)
     residuals = target - motion.apply(source)
-    half = np.arange(len(source)) % 2 == 0
-    check = target[~half] - estimate_rigid(source[half], target[half]).apply(source[~half])
+    # Patches overlap their neighbours; squares of a checkerboard share hardly any pixel.
+    half = (target // (3 * size)).sum(axis=1) % 2 == 0
+    check = residuals
+    if 3 < half.sum() < len(half) - 3:
+        check = target[~half] - estimate_rigid(source[half], target[half]).apply(source[~half])
     gain, offset = _grey_relation(left, right, motion, target)
-    thin = slice(None, None, -(-len(target) // _RESIDUALS_KEPT))
     return Seam(
         motion=motion,
         features=coarse.inliers,
@@ -253,13 +261,18 @@ def refine_seam(
         rms_px=float(np.sqrt(np.mean(residuals**2))),
         check_rms_px=float(np.sqrt(np.mean(check**2))),
         overlap_px=int(left.shape[1] - motion.shift[0]),
-        residuals=np.column_stack([target, residuals])[thin],
+        residuals=thinned(target, residuals),
         gain=gain,
         offset=offset,
     )
 
 
-def _robust_rigid(source: FloatArray, target: FloatArray, start: Rigid) -> Rigid:
+def thinned(places: FloatArray, residuals: FloatArray) -> FloatArray:
+    """Places and residuals (N, 4) of a few hundred points, for the record."""
+    return np.column_stack([places, residuals])[:: max(1, -(-len(places) // _RESIDUALS_KEPT))]
+
+
+def robust_rigid(source: FloatArray, target: FloatArray, start: Rigid) -> Rigid:
     """Rigid motion with Tukey's weights, from an estimate that is nearly right."""
     motion = start
     for _ in range(5):
@@ -286,16 +299,45 @@ def _lattice(left_shape: tuple[int, ...], right_shape: tuple[int, ...], motion: 
     return size, np.stack(np.meshgrid(np.round(xs), np.round(ys)), axis=-1).reshape(-1, 2)
 
 
-def _correlate(
-    left: ByteArray, right: ByteArray, motion: Rigid, points: FloatArray, *, size: int, search_px: int, threads: int
+def correlate_patches(
+    left: ByteArray,
+    right: ByteArray,
+    motion: Rigid,
+    points: FloatArray,
+    *,
+    size: tuple[int, int],
+    search_px: int,
+    threads: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Shift (row, column), score and ratio of each patch of the left part in the resampled right part."""
-    half, reach = size // 2, size // 2 + search_px
+    """Shift (row, column), score and ratio of each patch of the left part in the resampled right part.
+
+    Parameters
+    ----------
+    left, right : (rows, columns) uint8 arrays
+    motion : Rigid
+        Right part to left part.
+    points : (N, 2) array
+        Patch centres, whole pixels (x, y) of the left part.
+    size : (rows, columns)
+        Of a patch, even numbers.
+    search_px : int
+        Largest shift.
+    threads : int
+
+    Returns
+    -------
+    shift_rc : (N, 2) array, px
+        NaN where there is no peak inside.
+    score, ratio : (N,) arrays
+        See `cosp.imaging.correlation.subpixel_peaks`.
+    """
+    rows, columns = size[0] // 2, size[1] // 2
+    reach_r, reach_c = rows + search_px, columns + search_px
 
     def one(point: FloatArray) -> tuple[ByteArray, ByteArray]:
         x, y = int(point[0]), int(point[1])
-        search = resample(right, motion, Window(y - reach, y + reach, x - reach, x + reach))
-        return crop(left, Window(y - half, y + half, x - half, x + half)), search
+        search = resample(right, motion, Window(y - reach_r, y + reach_r, x - reach_c, x + reach_c))
+        return crop(left, Window(y - rows, y + rows, x - columns, x + columns)), search
 
     with ThreadPoolExecutor(threads) as pool:
         pairs = list(pool.map(one, points))
@@ -368,98 +410,6 @@ def _grey_relation(left: ByteArray, right: ByteArray, motion: Rigid, points: Flo
         misfit = a - gain * b - offset
         kept = np.abs(misfit - np.median(misfit)) < 3 * max(nmad(misfit), 0.3)
     return gain, offset
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where the parts lie in the joined film, left to right.
-
-    Parameters
-    ----------
-    motions : Rigid of each part
-        Part to joined film, px.
-    greys : (gain, offset) of each part
-        Balanced grey value = gain * grey value + offset.
-    joints_px : float of each seam
-        Column in which one part hands over to the next.
-    feathers_px : float of each seam
-        Width of the band in which they are blended.
-    shape : (rows, columns)
-        Of the joined film.
-    """
-
-    motions: tuple[Rigid, ...]
-    greys: tuple[tuple[float, float], ...]
-    joints_px: tuple[float, ...]
-    feathers_px: tuple[float, ...]
-    shape: tuple[int, int]
-
-
-def lay_out(shapes: Sequence[tuple[int, int]], seams: Sequence[Seam], *, feather_px: float) -> Layout:
-    """Parts placed side by side by their seams, grey values balanced so that the mean change is none.
-
-    Parameters
-    ----------
-    shapes : (rows, columns) of each part, left to right
-    seams : Seam between each two
-    feather_px : float
-        Width of the blended band; less where the overlap is narrow.
-    """
-    motions = [Rigid(0.0, (0.0, 0.0))]
-    greys = [(1.0, 0.0)]
-    for seam in seams:
-        motions.append(motions[-1].after(seam.motion))
-        gain, offset = greys[-1]
-        greys.append((gain * seam.gain, gain * seam.offset + offset))
-    mean_gain = float(np.exp(np.mean([np.log(g) for g, _ in greys])))
-    mean_offset = float(np.mean([128.0 * g / mean_gain + o / mean_gain - 128.0 for g, o in greys]))
-    greys = [(g / mean_gain, o / mean_gain - mean_offset) for g, o in greys]
-
-    corners = [
-        m.apply(np.array([[0, 0], [c - 1, 0], [0, r - 1], [c - 1, r - 1]], float))
-        for m, (r, c) in zip(motions, shapes, strict=True)
-    ]
-    low = np.floor(np.min([c.min(axis=0) for c in corners], axis=0) + 1e-6)
-    high = np.ceil(np.max([c.max(axis=0) for c in corners], axis=0) - 1e-6)
-    moved = tuple(Rigid(m.rotation_rad, (float(m.shift[0] - low[0]), float(m.shift[1] - low[1]))) for m in motions)
-    joints, feathers = [], []
-    for k in range(len(seams)):
-        begin, end = corners[k + 1][[0, 2], 0].max() - low[0], corners[k][[1, 3], 0].min() - low[0]
-        joints.append(float((begin + end) / 2))
-        feathers.append(float(max(1.0, min(feather_px, (end - begin) / 2))))
-    columns, rows = (high - low).astype(int) + 1
-    return Layout(moved, tuple(greys), tuple(joints), tuple(feathers), (int(rows), int(columns)))
-
-
-def compose(parts: Sequence[ByteArray], layout: Layout, window: Window) -> ByteArray:
-    """The joined film in a window: each part resampled once, balanced, blended across the joints; 0 outside."""
-    columns = np.arange(window.column0, window.column1, dtype=float)
-    entering = _steps(columns, layout)
-    total = np.zeros((window.row1 - window.row0, window.column1 - window.column0), np.float32)
-    weight_sum = np.zeros_like(total)
-    for k, (part, motion) in enumerate(zip(parts, layout.motions, strict=True)):
-        weight = entering[k] * (1.0 - entering[k + 1])
-        used = np.flatnonzero(weight > 0)
-        if used.size == 0:
-            continue
-        c0, c1 = int(used[0]), int(used[-1]) + 1
-        seen = resample(part, motion, Window(window.row0, window.row1, window.column0 + c0, window.column0 + c1))
-        gain, offset = layout.greys[k]
-        table = np.clip(gain * np.arange(256) + offset, 1.0, 255.0).astype(np.float32)
-        table[0] = 0.0
-        mask = np.where(seen > 0, weight[c0:c1].astype(np.float32), np.float32(0.0))
-        total[:, c0:c1] += mask * table[seen]
-        weight_sum[:, c0:c1] += mask
-    return np.asarray(np.rint(np.divide(total, weight_sum, out=total, where=weight_sum > 0)), dtype=np.uint8)
-
-
-def _steps(columns: FloatArray, layout: Layout) -> list[FloatArray]:
-    """Weight with which each part has entered, 1 before the first and 0 after the last, per column."""
-    steps = [np.ones(len(columns))]
-    for joint, feather in zip(layout.joints_px, layout.feathers_px, strict=True):
-        ramp = np.clip((columns - joint) / feather + 0.5, 0.0, 1.0)
-        steps.append(ramp * ramp * (3.0 - 2.0 * ramp))
-    return [*steps, np.zeros(len(columns))]
 
 
 def require_part(

@@ -6,6 +6,7 @@ the exposed area (x along the film, y up), at many x.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,10 +15,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from cosp.film.exposure import LINE_MM, Exposure, without_lines
+from cosp.film.joining import Layout, view
 from cosp.geometry.robust import running_median, tukey_weights
 from cosp.geometry.statistics import nmad
-from cosp.imaging.resampling import sample
-from cosp.imaging.windows import Window
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,9 @@ class Trace:
         return float(nmad(bend) / np.sqrt(1.5))
 
 
-def band_window(exposure: Exposure, y_mm: tuple[float, float], shape: tuple[int, int]) -> Window:
-    """Window of the joined film that holds the band between two y (low, high) over the length of the format."""
-    half = exposure.half_length_mm
-    corners = np.array([[x, y] for x in (-half, half) for y in y_mm])
-    rows, columns = exposure.pixels(corners)
-    return Window(
-        max(int(rows.min()) - 3, 0),
-        max(min(int(rows.max()) + 5, shape[0]), 1),
-        max(int(columns.min()) - 3, 0),
-        min(int(columns.max()) + 5, shape[1]),
-    )
-
-
 def band_profiles(
-    image: ByteArray,
-    window: Window,
+    parts: Sequence[ByteArray],
+    layout: Layout,
     exposure: Exposure,
     *,
     x_mm: FloatArray,
@@ -88,12 +75,12 @@ def band_profiles(
 
     Parameters
     ----------
-    image : array of the window's shape
-        That window of the joined film.
-    window : Window
+    parts : (rows, columns) uint8 array of each place of the layout
+    layout : Layout
+        Of the joined film.
     exposure : Exposure
     x_mm : (N,) array, evenly spaced
-    y_mm : (rows,) array
+    y_mm : (rows,) array, evenly spaced
         Above the base.
     base_mm : (N,) array
         Height of the line that the profiles are taken along.
@@ -111,9 +98,8 @@ def band_profiles(
     for start in range(0, len(x_mm), chunk):
         x = (x_mm[start : start + chunk, None] + within).ravel()
         base = np.interp(x, x_mm, base_mm)
-        xy = np.stack(np.broadcast_arrays(x[None, :], base + y_mm[:, None]), axis=-1)
-        rows, columns = exposure.pixels(xy)
-        grey = sample(image, rows - window.row0, columns - window.column0, interpolation="linear")
+        begin, end = (np.stack(exposure.pixels(np.stack([x, base + y], axis=-1))[::-1], axis=-1) for y in y_mm[[0, -1]])
+        grey = view(parts, layout, begin, end, len(y_mm))
         profiles[:, start : start + chunk] = grey.reshape(len(y_mm), -1, samples).mean(axis=2, dtype=np.float32)
     return profiles
 
@@ -168,7 +154,11 @@ def trace_ridge(
     path = _best_path(np.clip(ridge / noise, -3.0, 12.0), max(1, round(slope_mm / pixel)))
     columns = np.arange(band.shape[1])
     strength = ridge[path, columns]
-    rows = _refined(ridge, path) if width < _NARROW_PX else _centroids(band, path, min(3.0 * width, _CLEAR_MM / pixel))
+    if width < _NARROW_PX:
+        # A wide ridge feels the picture on one side of the line; the narrowest one does not.
+        rows = _refined(_ridge(band, _widths_px(pixel)[0]), path, reach=max(1, round(width)))
+    else:
+        rows = _centroids(band, path, min(3.0 * width, _CLEAR_MM / pixel))
     place = np.interp(rows, np.arange(len(y_mm)), y_mm)
     y = np.where(strength > min_contrast * noise, place, np.nan)
     return Trace(side, x_mm, _without_outliers(y, outlier_mm), strength)
@@ -224,7 +214,7 @@ def smooth_base(edge: Trace, *, straight_mm: float, min_share: float) -> FloatAr
         return np.full(len(edge.x_mm), straight_mm)
     u = np.linspace(-1.0, 1.0, len(edge.x_mm))
     seen = edge.seen
-    trend = _robust_trend(u[seen], edge.y_mm[seen])
+    trend = robust_trend(u[seen], edge.y_mm[seen])
     # Between and beyond the places seen the polynomial may run away: the straight line between them does not.
     return np.interp(u, u[seen], trend)
 
@@ -275,13 +265,13 @@ def _path_mean(gain: Float32Array, reach: int) -> float:
     return float(limited[path, np.arange(gain.shape[1])].mean())
 
 
-def _refined(ridge: Float32Array, path: np.ndarray[tuple[int], np.dtype[np.int64]]) -> FloatArray:
-    """Row of the ridge's top, from the parabola through three places."""
+def _refined(ridge: Float32Array, path: np.ndarray[tuple[int], np.dtype[np.int64]], *, reach: int) -> FloatArray:
+    """Row of the ridge's top within some rows of a path, from the parabola through three places."""
     columns = np.arange(len(path))
-    inner = np.clip(path, 1, ridge.shape[0] - 2)
-    # The path may run beside the top by a pixel.
-    around = np.stack([ridge[np.clip(inner + d, 0, ridge.shape[0] - 1), columns] for d in (-1, 0, 1)])
-    inner = np.clip(inner + around.argmax(axis=0) - 1, 1, ridge.shape[0] - 2)
+    last = ridge.shape[0] - 1
+    offsets = np.arange(-reach, reach + 1)
+    around = np.stack([ridge[np.clip(path + d, 0, last), columns] for d in offsets])
+    inner = np.clip(path + offsets[around.argmax(axis=0)], 1, last - 1)
     a, b, c = (ridge[inner + d, columns].astype(np.float64) for d in (-1, 0, 1))
     curve = a - 2 * b + c
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -318,7 +308,7 @@ def _without_outliers(y_mm: FloatArray, limit_mm: float) -> FloatArray:
         seen = np.flatnonzero(np.isfinite(y))
         if seen.size < 4 * _TREND_DEGREE:
             return np.full_like(y, np.nan)
-        departure = y[seen] - _robust_trend(u[seen], y[seen])
+        departure = y[seen] - robust_trend(u[seen], y[seen])
         departure -= running_median(departure, width)
         y[seen[np.abs(departure) > max(limit_mm, 3.0 * nmad(departure))]] = np.nan
     return y
@@ -328,10 +318,14 @@ def _without_outliers(y_mm: FloatArray, limit_mm: float) -> FloatArray:
 _TREND_DEGREE = 9
 
 
-def _robust_trend(u: FloatArray, y: FloatArray) -> FloatArray:
-    """Polynomial through most of the places."""
+def robust_trend(
+    u: FloatArray, y: FloatArray, degree: int = _TREND_DEGREE, *, at: FloatArray | None = None
+) -> FloatArray:
+    """Polynomial through most of the places that are finite, at the places `at` (None: at all); -1 to 1."""
+    at = u if at is None else at
+    u, y = u[np.isfinite(y)], y[np.isfinite(y)]
     weights = np.ones_like(y)
     for _ in range(10):
-        trend = np.polynomial.Legendre.fit(u, y, _TREND_DEGREE, w=np.sqrt(np.maximum(weights, 1e-6)), domain=[-1, 1])(u)
-        weights = tukey_weights((y - trend) / max(nmad(y - trend), 1e-4))
-    return np.asarray(trend)
+        trend = np.polynomial.Legendre.fit(u, y, degree, w=np.sqrt(np.maximum(weights, 1e-6)), domain=[-1, 1])
+        weights = tukey_weights((y - trend(u)) / max(nmad(y - trend(u)), 1e-4))
+    return np.asarray(trend(at))

@@ -75,6 +75,11 @@ class PixelGrid:
             (row1 - row0, column1 - column0),
         )
 
+    def flipped(self, *, x: bool, y: bool) -> PixelGrid:
+        """The same pixels with the sign of x, of y or of both changed."""
+        sign_x, sign_y = (-1 if x else 1), (-1 if y else 1)
+        return PixelGrid(sign_x * self.x0, sign_y * self.y0, sign_x * self.step_x, sign_y * self.step_y, self.shape)
+
     def coarsened(self, factor: int) -> PixelGrid:
         """Grid of blocks of factor x factor pixels; the last block may be partly outside."""
         shift = (factor - 1) / 2

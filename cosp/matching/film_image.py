@@ -76,12 +76,16 @@ class FilmImage:
 
         return FilmImage(self.grid, read_buffered)
 
+    def laid(self, *, turned: bool, mirrored: bool) -> FilmImage:
+        """The same pixels as a film that is turned by 180 degrees, mirrored across its length (y), or both."""
+        return FilmImage(self.grid.flipped(x=turned, y=turned != mirrored), self.read)
+
     def part(self, low_x_mm: float, high_x_mm: float) -> FilmImage:
         """The film between two places along it, as far as it reaches; at least one column."""
         columns = self.grid.shape[1]
         _, ends = self.grid.pixels(np.array([[low_x_mm, 0.0], [high_x_mm, 0.0]]))
-        first = int(np.clip(np.floor(ends[0]), 0, columns - 1))
-        last = int(np.clip(np.ceil(ends[1]) + 1, first + 1, columns))
+        first = int(np.clip(np.floor(ends.min()), 0, columns - 1))
+        last = int(np.clip(np.ceil(ends.max()) + 1, first + 1, columns))
         grid = self.grid.window(0, self.grid.shape[0], first, last)
         read = self.read
         return FilmImage(grid, lambda w: read(Window(w.row0, w.row1, w.column0 + first, w.column1 + first)))

@@ -37,7 +37,8 @@ class Footprint:
     shift_east_m, shift_north_m : float
         From the predicted place of the film's centre to the found one.
     turned : bool
-        The film lies turned by 180 degrees against the prediction.
+        The film raster lies turned by 180 degrees; the camera's film points are those of the raster with the signs of x
+        and y changed.
     score : float
         Height of the correlation peak of the whole search, in standard deviations of its surroundings.
     margin : float
@@ -50,12 +51,26 @@ class Footprint:
     posting_m : float
         Of the last level.
     reference : str
-        "image" or "relief".
+        "image", "relief", or "neighbours" where nothing but the neighbours speaks for the place: score, margin and
+        agreeing share are 0 then.
     sun_azimuth_deg : float
         Of the shaded relief; meaningless for an image.
     corners_lonlat : four (longitude, latitude), degrees
         Of the picture at the mean height: (-x, +y), (+x, +y), (+x, -y), (-x, -y).
     blocks : tuple of FilmBlock
+    mirrored : bool
+        The film raster lies mirrored across its length; the camera's film points are those of the raster with the sign
+        of y changed, besides what `turned` says.
+    rival_score : float
+        Height of the best other peak of the whole search.
+    rotation_deg, scale : float
+        Heading (counter-clockwise) and size on the ground of what was found, against the prediction.
+    sun_elevation_deg : float
+        Of the shaded relief.
+    sigma_m : float
+        Standard deviation of the place on the ground, per coordinate.
+    neighbours : tuple of str
+        Frames of the same pass that say where this one is to be looked for, where it could not be placed by itself.
     """
 
     KIND: ClassVar[str] = "footprint"
@@ -75,3 +90,29 @@ class Footprint:
     sun_azimuth_deg: float
     corners_lonlat: tuple[tuple[float, float], ...]
     blocks: tuple[FilmBlock, ...]
+    mirrored: bool = False
+    rival_score: float = 0.0
+    rotation_deg: float = 0.0
+    scale: float = 1.0
+    sun_elevation_deg: float = 35.0
+    sigma_m: float = float("nan")
+    neighbours: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A frame looked for by itself: where it lies, or why that is not known.
+
+    Parameters
+    ----------
+    scene : str
+    footprint : Footprint or None
+    refusal : str or None
+    """
+
+    KIND: ClassVar[str] = "placement"
+    VERSION: ClassVar[int] = 1
+
+    scene: str
+    footprint: Footprint | None
+    refusal: str | None

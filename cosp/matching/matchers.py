@@ -7,8 +7,12 @@ from typing import Protocol
 from cosp.arrays import FloatArray
 from cosp.errors import InputError
 from cosp.matching.correspondences import Correspondences
+from cosp.matching.lightglue import LearnedMatcher, lightglue, superglue
 from cosp.matching.sift import SiftMatcher
 from cosp.matching.structural import StructuralMatcher
+
+LEARNED = ("lightglue", "superglue")
+"""Matchers that look for features of their own in large tiles."""
 
 
 class Matcher(Protocol):
@@ -20,22 +24,45 @@ class Matcher(Protocol):
 
 
 def matcher_by_name(
-    name: str, *, template_px: int, search_px: int, min_score: float, max_ratio: float, max_return_px: float
+    name: str,
+    *,
+    template_px: int,
+    search_px: int,
+    min_score: float,
+    max_ratio: float,
+    max_return_px: float,
+    features: str | None = None,
+    max_features: int | None = None,
+    superglue_weights: str | None = None,
 ) -> Matcher:
-    """The matcher of a name, "structural" or "sift".
+    """The matcher of a name, "structural", "sift", "lightglue" or "superglue".
+
+    Parameters
+    ----------
+    template_px, search_px, min_score, max_ratio, max_return_px
+        See `StructuralMatcher`, which also refines what the learned matchers find.
+    features, max_features
+        See `lightglue`.
+    superglue_weights : str
+        See `superglue`.
 
     Raises
     ------
     InputError
-        For a name that is not known, or one whose learned weights are not installed.
+        For a name that is not known, or one whose packages or weights are not there.
     """
+    precise = structural(template_px, search_px, min_score, max_ratio, max_return_px)
     if name == "structural":
-        return structural(template_px, search_px, min_score, max_ratio, max_return_px)
+        return precise
     if name == "sift":
         return SiftMatcher(search_px=search_px, max_ratio=_SIFT_RATIO, max_features=_SIFT_FEATURES)
-    if name == "lightglue":
-        raise InputError("matcher 'lightglue' needs learned weights, which this version cannot load; use 'structural'")
-    raise InputError(f"matcher {name!r} is not one of 'structural', 'sift'")
+    if name == "lightglue" and features is not None and max_features is not None:
+        return LearnedMatcher(lightglue(features, max_features), precise, search_px)
+    if name == "superglue":
+        if superglue_weights is None:
+            raise InputError("matcher 'superglue' needs weights of your own; name their folder by superglue_weights")
+        return LearnedMatcher(superglue(superglue_weights), precise, search_px)
+    raise InputError(f"matcher {name!r} is not one of 'structural', 'sift', 'lightglue', 'superglue'")
 
 
 def structural(

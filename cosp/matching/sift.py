@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cosp.arrays import ByteArray, FloatArray
+from cosp.arrays import FloatArray
+from cosp.imaging.contrast import percentile_stretch
 from cosp.matching.correspondences import Correspondences
 
 # Spread of a SIFT position, in pixels of the image it was found in [Lowe2004, section 4 and common practice].
@@ -37,7 +38,8 @@ class SiftMatcher:
         del points_rc, threads
         detector = cv2.SIFT.create(nfeatures=self.max_features)
         found = [
-            detector.detectAndCompute(_bytes(image), np.isfinite(image).astype(np.uint8)) for image in (moving, fixed)
+            detector.detectAndCompute(percentile_stretch(image), np.isfinite(image).astype(np.uint8))
+            for image in (moving, fixed)
         ]
         (keys_a, descriptors_a), (keys_b, descriptors_b) = found
         if min(len(keys_a), len(keys_b)) < 2:
@@ -57,13 +59,3 @@ class SiftMatcher:
         near = np.abs(a - b).max(axis=1) <= self.search_px
         score = np.array([s for _, _, s in good], float)[near]
         return Correspondences(a[near], b[near], score, np.full(len(score), _SIGMA_PX))
-
-
-def _bytes(image: FloatArray) -> ByteArray:
-    """The image stretched between its 1 % and 99 % values, 0 where there is nothing."""
-    valid = np.isfinite(image)
-    if not valid.any():
-        return np.zeros(image.shape, np.uint8)
-    low, high = np.percentile(image[valid], [1, 99])
-    stretched = (np.where(valid, image, low) - low) * (255.0 / max(high - low, 1e-6))
-    return np.asarray(np.clip(stretched, 0, 255), np.uint8)

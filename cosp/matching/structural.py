@@ -122,51 +122,103 @@ class StructuralMatcher:
             Places in `moving`, rounded to whole pixels; those too near the border are left out.
         threads : int
         """
+        channels = self._channels(moving, fixed)
+        points = np.unique(np.round(np.asarray(points_rc, float).reshape(-1, 2)).astype(np.intp), axis=0)
+        found, _ = self._match_about(channels, moving, fixed, points, points, self.search_px, self.max_ratio, threads)
+        return found
+
+    def refine(
+        self, moving: FloatArray, fixed: FloatArray, matches: Correspondences, *, reach_px: int, threads: int
+    ) -> Correspondences:
+        """Matches of another matcher brought to a fraction of a pixel, without those that structure does not confirm.
+
+        Parameters
+        ----------
+        moving, fixed : (rows, columns) arrays of equal shape
+            NaN where there is nothing.
+        matches : Correspondences
+            Their own scores are kept: they tell right from wrong better than a correlation that only has to place.
+        reach_px : int
+            How far a match may be off.
+        threads : int
+        """
+        start = np.round(matches.moving_rc).astype(np.intp)
+        expected = start + np.round(matches.fixed_rc - matches.moving_rc).astype(np.intp)
+        channels = self._channels(moving, fixed)
+        # Which of a few places within reach is right has been decided already: no ratio test.
+        found, kept = self._match_about(channels, moving, fixed, start, expected, reach_px, np.inf, threads)
+        return Correspondences(found.moving_rc, found.fixed_rc, matches.score[kept], found.sigma_px)
+
+    def _channels(self, moving: FloatArray, fixed: FloatArray) -> list[Float32Array]:
+        return [orientation_channels(image, bins=self.bins, sigma_px=self.sigma_px) for image in (moving, fixed)]
+
+    def _match_about(
+        self,
+        channels: list[Float32Array],
+        moving: FloatArray,
+        fixed: FloatArray,
+        points: IntArray,
+        expected: IntArray,
+        margin: int,
+        max_ratio: float,
+        threads: int,
+    ) -> tuple[Correspondences, IntArray]:
+        """Matches of points of one image near expected places of the other, and which of the points they are."""
         half = self.template_px // 2
-        channels = [orientation_channels(image, bins=self.bins, sigma_px=self.sigma_px) for image in (moving, fixed)]
-        centres: IntArray = np.unique(np.round(np.asarray(points_rc, float).reshape(-1, 2)).astype(np.intp), axis=0)
-        centres = _inside(centres, moving.shape, half + self.search_px)
         moving_share, fixed_share = (_box_share(np.isfinite(image), half) for image in (moving, fixed))
-        centres = centres[moving_share[centres[:, 0], centres[:, 1]] >= self.min_valid]
+        usable = _is_inside(points, moving.shape, half) & _is_inside(expected, fixed.shape, half + margin)
+        usable[usable] = moving_share[points[usable, 0], points[usable, 1]] >= self.min_valid
+        chosen = np.flatnonzero(usable)
 
-        def work(start: int) -> Correspondences:
-            return self._match_batch(channels, fixed_share, centres[start : start + _BATCH])
+        def work(start: int) -> tuple[Correspondences, IntArray]:
+            batch = chosen[start : start + _BATCH]
+            found, good = self._match_batch(channels, fixed_share, points[batch], expected[batch], margin, max_ratio)
+            return found, batch[good]
 
-        starts = range(0, len(centres), _BATCH)
-        if threads > 1 and len(centres) > _BATCH:
+        starts = range(0, len(chosen), _BATCH)
+        if threads > 1 and len(chosen) > _BATCH:
             with ThreadPoolExecutor(threads) as pool:
                 parts = list(pool.map(work, starts))
         else:
             parts = [work(start) for start in starts]
-        return Correspondences.joined(parts)
+        kept = np.concatenate([np.empty(0, np.intp), *(kept for _, kept in parts)])
+        return Correspondences.joined([found for found, _ in parts]), kept
 
     def _match_batch(
-        self, channels: list[Float32Array], fixed_share: Float32Array, centres: IntArray
-    ) -> Correspondences:
-        """Matches of a few templates, forward and backward."""
+        self,
+        channels: list[Float32Array],
+        fixed_share: Float32Array,
+        centres: IntArray,
+        expected: IntArray,
+        margin: int,
+        max_ratio: float,
+    ) -> tuple[Correspondences, IntArray]:
+        """Matches of a few templates, forward and backward, and which of them they are."""
         half = self.template_px // 2
         moving, fixed = channels
-        forward, score, ratio = _find(moving, fixed, centres, centres, half, self.search_px)
-        good = np.isfinite(forward).all(1) & (score >= self.min_score) & (ratio <= self.max_ratio)
+        forward, score, ratio = _find(moving, fixed, centres, expected, half, margin)
+        good = np.isfinite(forward).all(1) & (score >= self.min_score) & (ratio <= max_ratio)
         whole = np.round(np.where(good[:, None], forward, 0.0)).astype(np.intp)
-        target = centres + whole
+        target = expected + whole
         good &= fixed_share[target[:, 0], target[:, 1]] >= self.min_valid
         good[good] = _is_inside(target[good], fixed.shape[1:], half + _BACKWARD_PX)
-        good[good] &= _is_inside(centres[good], fixed.shape[1:], half + _BACKWARD_PX)
-        centres, target, whole = centres[good], target[good], whole[good]
-        forward, score, ratio = forward[good], score[good], ratio[good]
+        good[good] &= _is_inside(centres[good], moving.shape[1:], half + _BACKWARD_PX)
+        kept = np.flatnonzero(good)
+        centres, expected, target, whole = centres[kept], expected[kept], target[kept], whole[kept]
+        forward, score = forward[kept], score[kept]
         backward, back_score, _ = _find(fixed, moving, target, centres, half, _BACKWARD_PX)
         miss = np.linalg.norm(backward + (forward - whole), axis=1)
         with np.errstate(invalid="ignore"):
             good = miss <= self.max_return_px
         shift = (forward + whole - backward) / 2
-        score = np.minimum(score, back_score)
-        return Correspondences(
+        score = np.minimum(score, back_score)[good]
+        found = Correspondences(
             moving_rc=centres[good].astype(float),
-            fixed_rc=(centres + shift)[good],
-            score=score[good],
-            sigma_px=_sigma_px(score[good]),
+            fixed_rc=(expected + shift)[good],
+            score=score,
+            sigma_px=_sigma_px(score),
         )
+        return found, kept[good]
 
 
 def _find(
@@ -193,10 +245,6 @@ def _crops(channels: Float32Array, centres: IntArray, half: int) -> Float32Array
 def _is_inside(centres: IntArray, shape: tuple[int, ...], margin: int) -> BoolArray:
     limit = np.array(shape) - margin
     return np.asarray(((centres >= margin) & (centres < limit)).all(axis=1))
-
-
-def _inside(centres: IntArray, shape: tuple[int, ...], margin: int) -> IntArray:
-    return centres[_is_inside(centres, shape, margin)]
 
 
 def _box_share(valid: BoolArray, half: int) -> Float32Array:

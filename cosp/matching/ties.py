@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,9 @@ _TERRAIN_POSTING_M = 200.0
 _DEGREE_X, _DEGREE_Y = 4, 1
 _MIN_FOR_OFFSET = 40
 # Candidates along either side of a map tile.
-_TILE_SIDE = 3
+_TILE_SIDE = 4
+# Cells of the film, along and across, by which coverage is told.
+_CELLS = (30, 4)
 # However high the score: terrain that the DEM does not hold shows differently in two films taken 30 degrees apart.
 _LEAST_SIGMA_PX = 0.3
 
@@ -125,8 +128,14 @@ def match_films(
     area = grown(terrain.grid.bounds, 0.6 * tile_px * _COARSE * pixel_m)
     projectors = [MapProjector(camera, crs, area) for camera in (fore_camera, aft_camera)]
 
+    share = float(_seen_by(aft_camera, fore_camera, _tile_points(fore_camera, 1000), terrain.mean_m).mean())
+
     def pass_at(posting_m: float, offset: Callable[[FloatArray], FloatArray], count: int) -> FilmMatches:
-        points_mm = _tile_points(fore_camera, max(1, count // _TILE_SIDE**2))
+        # Templates that overlap by more than half say little more.
+        most = share * _area_mm2(fore_camera) / (step_px * posting_m / pixel_m * fore.pixel_mm) ** 2
+        tiles = max(1, int(min(count, most)) // _TILE_SIDE**2)
+        points_mm = _tile_points(fore_camera, max(1, round(tiles / max(share, 1e-3))))
+        points_mm = points_mm[_seen_by(aft_camera, fore_camera, points_mm, terrain.mean_m)]
         factors = [reduction_for(posting_m, ground_pixel_m(c, f.pixel_mm, terrain.mean_m)) for c, f in
                    ((fore_camera, fore), (aft_camera, aft))]  # fmt: skip
         films = [film.reduced(n) if n > 1 else film.buffered() for film, n in zip((fore, aft), factors, strict=True)]
@@ -169,6 +178,45 @@ def match_films(
     ties = pass_at(pixel_m, _smooth_offset(coarse, aft_camera), candidates)
     require(len(ties), min_ties, f"{fore_camera.scene} and {aft_camera.scene}", "tie points")
     return ties
+
+
+def _area_mm2(camera: PanoramicCamera) -> float:
+    return 4 * camera.half_length_mm * camera.half_width_mm
+
+
+def _seen_by(other: PanoramicCamera, camera: PanoramicCamera, film_mm: FloatArray, height_m: float) -> BoolArray:
+    """Which film points show ground that another film shows too."""
+    seen = np.abs(other.project_geodetic(camera.locate_geodetic(film_mm, height_m)))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((seen <= [other.half_length_mm, other.half_width_mm]).all(axis=-1))
+
+
+def summary(
+    ties: FilmMatches, fore_camera: PanoramicCamera, aft_camera: PanoramicCamera, *, height_m: float
+) -> dict[str, Any]:
+    """Count, precision and spread of tie points.
+
+    Coverage is the share of equal cells of the fore film that hold a tie point, of those whose middle both films show
+    on ground of about the height given.
+    """
+    columns, rows = _CELLS
+    half = np.array([fore_camera.half_length_mm, fore_camera.half_width_mm])
+    middles = film_lattice(half[0], half[1], columns, rows)
+    shared = _seen_by(aft_camera, fore_camera, middles, height_m).reshape(columns, rows)
+    index = np.clip(((ties.fore_mm / half + 1) / 2 * _CELLS).astype(int), 0, np.array(_CELLS) - 1)
+    counts = np.zeros(_CELLS, int)
+    np.add.at(counts, (index[:, 0], index[:, 1]), 1)
+    filled = (counts > 0) & shared
+    return {
+        "count": len(ties),
+        "sigma_px": float(np.median(ties.sigma_px)) if len(ties) else None,
+        "score": float(np.median(ties.score)) if len(ties) else None,
+        "cells_shared": int(shared.sum()),
+        "coverage": float(filled.sum() / max(shared.sum(), 1)),
+        "coverage_along": float(filled.any(axis=1).sum() / max(shared.any(axis=1).sum(), 1)),
+        "coverage_across": float(filled.any(axis=0).sum() / max(shared.any(axis=0).sum(), 1)),
+        "counts_along": counts.sum(axis=1).tolist(),
+    }
 
 
 def _tile_points(camera: PanoramicCamera, count: int) -> FloatArray:

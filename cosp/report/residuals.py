@@ -36,7 +36,7 @@ class FilmResiduals:
     caption: str
 
 
-def draw_residuals(films: Sequence[FilmResiduals]) -> Figure:
+def draw_residuals(films: Sequence[FilmResiduals], *, label: str = "smoothed residual, px") -> Figure:
     """One panel per film: size of the smoothed residuals as colour, residuals as arrows, points as dots.
 
     The film is stretched across, being 13 times as long as wide; an arrow's x and y are those of the film.
@@ -69,5 +69,5 @@ def draw_residuals(films: Sequence[FilmResiduals]) -> Figure:
         panel.set_title(f"{film.scene}: {film.caption}", fontsize=9, loc="left")
         panel.set_ylabel("y, mm")
     panels[-1].set_xlabel("x along the film, mm")
-    figure.colorbar(colours, ax=list(panels), label="smoothed residual, px", shrink=0.8)
+    figure.colorbar(colours, ax=list(panels), label=label, shrink=0.8)
     return figure

@@ -43,6 +43,7 @@ def grid_points(
     points: FloatArray,
     grid: PixelGrid,
     *,
+    weights: FloatArray | None = None,
     kernel_cells: float,
     gate_sigmas: float,
     point_sigma_m: float,
@@ -59,13 +60,16 @@ def grid_points(
     points : (N, 3) array, m
         Easting, northing, height; NaN are left out. Points just outside the grid are not used.
     grid : PixelGrid
+    weights : (N,) array, optional
+        Inverse variance of each point, as a multiple of that of `point_sigma_m`; points of weight 0 are left out. All
+        1 when left out.
     kernel_cells : float
         Standard deviation, in cells, of the Gaussian of the distance between cells that weighs the neighbours' points.
     gate_sigmas : float
         Points farther from the local surface than this many robust standard deviations are left out; half the relief of
         the neighbouring cells is added, so that ridges stay.
     point_sigma_m : float
-        Matching noise as standard deviation of the height of one point. The scatter within a cell is never
+        Matching noise as standard deviation of the height of a point of weight 1. The scatter within a cell is never
         believed to be less, since neighbouring pixels err together.
     points_per_independent : float
         Number of neighbouring points that carry the information of one, for the same reason.
@@ -76,7 +80,14 @@ def grid_points(
     """
     rows, columns = grid.shape
     ordered, starts = kernels.sort_by_cell(
-        np.ascontiguousarray(points, dtype=float), grid.x0, grid.y0, grid.step_x, grid.step_y, rows, columns
+        np.ascontiguousarray(points, dtype=float),
+        np.ones(len(points), np.float32) if weights is None else np.asarray(weights, np.float32),
+        grid.x0,
+        grid.y0,
+        grid.step_x,
+        grid.step_y,
+        rows,
+        columns,
     )
     seeds = kernels.neighbourhood_medians(kernels.cell_medians(ordered, starts, rows, columns))
     along_columns, along_rows = kernels.slopes_per_cell(seeds)
@@ -90,7 +101,7 @@ def grid_points(
         kernels.neighbourhood_medians(scatter),
         gate_sigmas,
     )
-    height, deviation, effective = kernels.local_planes(
+    height, deviation, independent = kernels.local_planes(
         moments,
         seeds,
         along_columns,
@@ -98,9 +109,9 @@ def grid_points(
         math.exp(-1 / (2 * kernel_cells**2)),
         _SLOPE_WEIGHT,
         _NEIGHBOURS_TO_FILL,
+        points_per_independent,
     )
-    count = moments[..., 0].astype(np.int32)
-    independent = np.maximum(effective / points_per_independent, 1.0)
+    count = moments[..., 10].astype(np.int32)
     sigma = np.maximum(deviation, np.float32(point_sigma_m)) / np.sqrt(independent)
     return GriddedHeights(height, sigma.astype(np.float32), count)
 

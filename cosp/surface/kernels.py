@@ -13,11 +13,9 @@ from cosp.arrays import BoolArray, FloatArray, IntArray
 @njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
 def intersect_tabulated(
     fore_table: FloatArray,
-    fore_start: float,
-    fore_step: float,
+    fore_scale: tuple[float, float, float, float],
     aft_table: FloatArray,
-    aft_start: float,
-    aft_step: float,
+    aft_scale: tuple[float, float, float, float],
     fore: FloatArray,
     aft: FloatArray,
     ground: FloatArray,
@@ -25,46 +23,27 @@ def intersect_tabulated(
 ) -> None:
     """Midpoints of the common perpendiculars of tabulated rays.
 
-    A row of a table holds origin c, and a and b of the direction a + y b, at one x.
-    `fore` and `aft` are (N, 2) film points; `ground` (N, 3) and `miss` (N,) are filled.
+    A node of a table, (N, M, 6), holds origin and direction; the scales are (place along x at x = 0, per millimetre;
+    the same along y). Beyond the last node across, rays go on as between the last two. `fore` and `aft` are (N, 2)
+    film points; `ground` (N, 3) and `miss` (N,) are filled.
     """
-    fore_last = fore_table.shape[0] - 2
-    aft_last = aft_table.shape[0] - 2
-    fore_scale = 1.0 / fore_step
-    aft_scale = 1.0 / aft_step
     for n in range(fore.shape[0]):
-        u = (fore[n, 0] - fore_start) * fore_scale
-        v = (aft[n, 0] - aft_start) * aft_scale
-        if not (0.0 <= u <= fore_last + 1 and 0.0 <= v <= aft_last + 1):
+        u = fore_scale[0] + fore_scale[1] * fore[n, 0]
+        v = fore_scale[2] + fore_scale[3] * fore[n, 1]
+        s = aft_scale[0] + aft_scale[1] * aft[n, 0]
+        t = aft_scale[2] + aft_scale[3] * aft[n, 1]
+        inside = 0.0 <= u <= fore_table.shape[0] - 1 and 0.0 <= s <= aft_table.shape[0] - 1
+        if not inside or np.isnan(v) or np.isnan(t):
             ground[n, 0] = np.nan
             ground[n, 1] = np.nan
             ground[n, 2] = np.nan
             miss[n] = np.nan
             continue
-        i = min(int(u), fore_last)
-        j = min(int(v), aft_last)
-        p = u - i
-        q = v - j
-        y = fore[n, 1]
-        c0 = fore_table[i, 0] + p * (fore_table[i + 1, 0] - fore_table[i, 0])
-        c1 = fore_table[i, 1] + p * (fore_table[i + 1, 1] - fore_table[i, 1])
-        c2 = fore_table[i, 2] + p * (fore_table[i + 1, 2] - fore_table[i, 2])
-        a0 = fore_table[i, 3] + p * (fore_table[i + 1, 3] - fore_table[i, 3])
-        a1 = fore_table[i, 4] + p * (fore_table[i + 1, 4] - fore_table[i, 4])
-        a2 = fore_table[i, 5] + p * (fore_table[i + 1, 5] - fore_table[i, 5])
-        a0 += y * (fore_table[i, 6] + p * (fore_table[i + 1, 6] - fore_table[i, 6]))
-        a1 += y * (fore_table[i, 7] + p * (fore_table[i + 1, 7] - fore_table[i, 7]))
-        a2 += y * (fore_table[i, 8] + p * (fore_table[i + 1, 8] - fore_table[i, 8]))
-        y = aft[n, 1]
-        w0 = c0 - (aft_table[j, 0] + q * (aft_table[j + 1, 0] - aft_table[j, 0]))
-        w1 = c1 - (aft_table[j, 1] + q * (aft_table[j + 1, 1] - aft_table[j, 1]))
-        w2 = c2 - (aft_table[j, 2] + q * (aft_table[j + 1, 2] - aft_table[j, 2]))
-        b0 = aft_table[j, 3] + q * (aft_table[j + 1, 3] - aft_table[j, 3])
-        b1 = aft_table[j, 4] + q * (aft_table[j + 1, 4] - aft_table[j, 4])
-        b2 = aft_table[j, 5] + q * (aft_table[j + 1, 5] - aft_table[j, 5])
-        b0 += y * (aft_table[j, 6] + q * (aft_table[j + 1, 6] - aft_table[j, 6]))
-        b1 += y * (aft_table[j, 7] + q * (aft_table[j + 1, 7] - aft_table[j, 7]))
-        b2 += y * (aft_table[j, 8] + q * (aft_table[j + 1, 8] - aft_table[j, 8]))
+        c0, c1, c2, a0, a1, a2 = _tabulated(fore_table, u, v)
+        w0, w1, w2, b0, b1, b2 = _tabulated(aft_table, s, t)
+        w0 = c0 - w0
+        w1 = c1 - w1
+        w2 = c2 - w2
         aa = a0 * a0 + a1 * a1 + a2 * a2
         ab = a0 * b0 + a1 * b1 + a2 * b2
         bb = b0 * b0 + b1 * b1 + b2 * b2
@@ -83,37 +62,75 @@ def intersect_tabulated(
         miss[n] = math.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
 
 
+@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
+def _tabulated(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float, float, float]:
+    """Six values between the nodes of a table, bilinear."""
+    i = min(int(u), table.shape[0] - 2)
+    j = min(max(int(v), 0), table.shape[1] - 2)
+    p = u - i
+    q = v - j
+    w11 = p * q
+    w10 = p - w11
+    w01 = q - w11
+    w00 = 1.0 - p - w01
+    a = table[i, j]
+    b = table[i, j + 1]
+    c = table[i + 1, j]
+    d = table[i + 1, j + 1]
+    return (
+        w00 * a[0] + w01 * b[0] + w10 * c[0] + w11 * d[0],
+        w00 * a[1] + w01 * b[1] + w10 * c[1] + w11 * d[1],
+        w00 * a[2] + w01 * b[2] + w10 * c[2] + w11 * d[2],
+        w00 * a[3] + w01 * b[3] + w10 * c[3] + w11 * d[3],
+        w00 * a[4] + w01 * b[4] + w10 * c[4] + w11 * d[4],
+        w00 * a[5] + w01 * b[5] + w10 * c[5] + w11 * d[5],
+    )
+
+
 @njit(nogil=True, cache=True)
 def sort_by_cell(
-    points: FloatArray, x0: float, y0: float, step_x: float, step_y: float, rows: int, columns: int
+    points: FloatArray,
+    weights: FloatArray,
+    x0: float,
+    y0: float,
+    step_x: float,
+    step_y: float,
+    rows: int,
+    columns: int,
 ) -> tuple[FloatArray, IntArray]:
-    """Points as (column, row, height) in the order of their cells, and where each cell starts.
+    """Points as (column, row, height, weight) in the order of their cells, and where each cell starts.
 
-    A point belongs to the cell whose centre is nearest. Points outside the grid are left out.
+    A point belongs to the cell whose centre is nearest. Points outside the grid or without weight are left out.
     """
     count = points.shape[0]
+    per_x = 1.0 / step_x
+    per_y = 1.0 / step_y
     cells = np.empty(count, np.int32)
     starts = np.zeros(rows * columns + 1, np.int64)
     for n in range(count):
-        u = (points[n, 0] - x0) / step_x + 0.5
-        v = (points[n, 1] - y0) / step_y + 0.5
+        u = (points[n, 0] - x0) * per_x + 0.5
+        v = (points[n, 1] - y0) * per_y + 0.5
         cells[n] = -1
-        if 0.0 <= u < columns and 0.0 <= v < rows and not np.isnan(points[n, 2]):
+        if 0.0 <= u < columns and 0.0 <= v < rows and weights[n] > 0.0 and not np.isnan(points[n, 2]):
             cell = int(v) * columns + int(u)
             cells[n] = cell
             starts[cell + 1] += 1
     for cell in range(rows * columns):
         starts[cell + 1] += starts[cell]
     place = starts[:-1].copy()
-    ordered = np.empty((starts[-1], 3), np.float32)
+    ordered = np.empty((starts[-1], 4), np.float32)
     for n in range(count):
         cell = cells[n]
         if cell >= 0:
             # Places within the grid, relative to the cell's centre: float32 keeps them to 1e-7 of a cell.
-            ordered[place[cell], 0] = (points[n, 0] - x0) / step_x - cell % columns
-            ordered[place[cell], 1] = (points[n, 1] - y0) / step_y - cell // columns
-            ordered[place[cell], 2] = points[n, 2]
-            place[cell] += 1
+            u = (points[n, 0] - x0) * per_x
+            v = (points[n, 1] - y0) * per_y
+            k = place[cell]
+            ordered[k, 0] = u - int(u + 0.5)
+            ordered[k, 1] = v - int(v + 0.5)
+            ordered[k, 2] = points[n, 2]
+            ordered[k, 3] = weights[n]
+            place[cell] = k + 1
     return ordered, starts
 
 
@@ -146,7 +163,30 @@ def _select(values: FloatArray, count: int, rank: int) -> float:
 
 
 @njit(nogil=True, cache=True)
+def _median_of_nine(v: FloatArray) -> float:
+    """Median of the first nine values, without branches: what each exchange orders is known beforehand."""
+    a, b, c = _ordered(v[0], v[1], v[2])
+    d, e, f = _ordered(v[3], v[4], v[5])
+    g, h, i = _ordered(v[6], v[7], v[8])
+    low = max(max(a, d), g)
+    middle = _ordered(b, e, h)[1]
+    high = min(min(c, f), i)
+    result: float = _ordered(low, middle, high)[1]
+    return result
+
+
+@njit(nogil=True, cache=True)
+def _ordered(a: float, b: float, c: float) -> tuple[float, float, float]:
+    low = min(a, b)
+    high = max(a, b)
+    return min(low, c), max(low, min(high, c)), max(high, c)
+
+
+@njit(nogil=True, cache=True)
 def _median(values: FloatArray, count: int) -> float:
+    if count == 9:
+        nine: float = _median_of_nine(values)
+        return nine
     upper: float = _select(values, count, count // 2)
     if count % 2:
         return upper
@@ -156,20 +196,22 @@ def _median(values: FloatArray, count: int) -> float:
     return 0.5 * (lower + upper)
 
 
+# Points of a cell that medians are taken of: they only say what lies far off, which a sample does as well.
+_MOST_SAMPLED = 9
+
+
 @njit(nogil=True, cache=True)
 def cell_medians(ordered: FloatArray, starts: IntArray, rows: int, columns: int) -> FloatArray:
-    """Median height of the points of each cell; NaN where there are none."""
-    most = 1
-    for cell in range(rows * columns):
-        most = max(most, starts[cell + 1] - starts[cell])
-    values = np.empty(most, np.float32)
+    """Median height of the points of each cell, of an even sample where there are many; NaN where there are none."""
+    values = np.empty(_MOST_SAMPLED, np.float32)
     medians = np.full((rows, columns), np.nan, np.float32)
     for cell in range(rows * columns):
         count = starts[cell + 1] - starts[cell]
         if count:
-            for i in range(count):
-                values[i] = ordered[starts[cell] + i, 2]
-            medians[cell // columns, cell % columns] = _median(values, count)
+            sampled = min(count, _MOST_SAMPLED)
+            for i in range(sampled):
+                values[i] = ordered[starts[cell] + i * count // sampled, 2]
+            medians[cell // columns, cell % columns] = _median(values, sampled)
     return medians
 
 
@@ -230,12 +272,9 @@ def cell_scatter(
     along_rows: FloatArray,
     least: float,
 ) -> FloatArray:
-    """Median absolute distance, times 1.4826, of the points of each cell from its seed plane."""
+    """Median absolute distance, times 1.4826, of the points of each cell (or a sample) from its seed plane."""
     rows, columns = seeds.shape
-    most = 1
-    for cell in range(rows * columns):
-        most = max(most, starts[cell + 1] - starts[cell])
-    values = np.empty(most, np.float32)
+    values = np.empty(_MOST_SAMPLED, np.float32)
     scatter = np.full((rows, columns), np.nan, np.float32)
     for row in range(rows):
         for column in range(columns):
@@ -243,11 +282,12 @@ def cell_scatter(
             count = starts[cell + 1] - starts[cell]
             if not count:
                 continue
-            for i in range(count):
-                n = starts[cell] + i
+            sampled = min(count, _MOST_SAMPLED)
+            for i in range(sampled):
+                n = starts[cell] + i * count // sampled
                 plane = seeds[row, column] + along_columns[row, column] * ordered[n, 0]
                 values[i] = abs(ordered[n, 2] - plane - along_rows[row, column] * ordered[n, 1])
-            scatter[row, column] = max(least, 1.4826 * _median(values, count))
+            scatter[row, column] = max(least, 1.4826 * _median(values, sampled))
     return scatter
 
 
@@ -261,13 +301,13 @@ def cell_moments(
     scatter: FloatArray,
     gate: float,
 ) -> FloatArray:
-    """Sums over the points of each cell: 1, x, y, xx, xy, yy, z, xz, yz, zz.
+    """Sums over the points of each cell: w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, wzz, 1.
 
-    x and y in cells from the cell's centre, z in metres from its seed. Points farther from the seed plane than `gate`
-    scatters plus half the range of the seeds around are left out.
+    x and y in cells from the cell's centre, z in metres from its seed, w the point's weight. Points farther from the
+    seed plane than `gate` scatters plus half the range of the seeds around are left out.
     """
     rows, columns = seeds.shape
-    moments = np.zeros((rows, columns, 10))
+    moments = np.zeros((rows, columns, 11))
     for row in range(rows):
         for column in range(columns):
             cell = row * columns + column
@@ -284,23 +324,30 @@ def cell_moments(
             limit = gate * scatter[row, column] + 0.5 * (highest - lowest)
             slope_x = along_columns[row, column]
             slope_y = along_rows[row, column]
-            m = moments[row, column]
+            sw = sx = sy = sxx = sxy = syy = sz = sxz = syz = szz = count = 0.0
             for n in range(starts[cell], starts[cell + 1]):
-                x = ordered[n, 0]
-                y = ordered[n, 1]
-                z = ordered[n, 2] - seed
+                x = float(ordered[n, 0])
+                y = float(ordered[n, 1])
+                z = float(ordered[n, 2]) - seed
                 if abs(z - slope_x * x - slope_y * y) > limit:
                     continue
-                m[0] += 1.0
-                m[1] += x
-                m[2] += y
-                m[3] += x * x
-                m[4] += x * y
-                m[5] += y * y
-                m[6] += z
-                m[7] += x * z
-                m[8] += y * z
-                m[9] += z * z
+                w = float(ordered[n, 3])
+                wx = w * x
+                wy = w * y
+                wz = w * z
+                count += 1.0
+                sw += w
+                sx += wx
+                sy += wy
+                sxx += wx * x
+                sxy += wx * y
+                syy += wy * y
+                sz += wz
+                sxz += wz * x
+                syz += wz * y
+                szz += wz * z
+            for k, total in enumerate((sw, sx, sy, sxx, sxy, syy, sz, sxz, syz, szz, count)):
+                moments[row, column, k] = total
     return moments
 
 
@@ -313,17 +360,19 @@ def local_planes(
     side_weight: float,
     slope_weight: float,
     neighbours_to_fill: int,
+    per_independent: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Height at each cell's centre of the plane fitted to the points of its 3 x 3 cells.
 
     The four cells beside weigh `side_weight`, the corners its square. `slope_weight` points at the distance of a cell
-    say that the slope is that of the seeds. Also returns the standard deviation of one point about the plane and the
-    number of points that the weights amount to.
+    say that the slope is that of the seeds. Also returns the standard deviation of a point of weight one about the
+    plane, and the number of such independent points that all amount to, where so many as `per_independent` count as
+    one, but never less than a single point of theirs.
     """
     rows, columns = seeds.shape
     heights = np.full((rows, columns), np.nan, np.float32)
     deviations = np.full((rows, columns), np.nan, np.float32)
-    effective = np.zeros((rows, columns), np.float32)
+    independent = np.ones((rows, columns), np.float32)
     for row in range(rows):
         for column in range(columns):
             seed = seeds[row, column]
@@ -332,6 +381,7 @@ def local_planes(
             filled = 0
             sw = 0.0
             sww = 0.0
+            sn = 0.0
             sx = 0.0
             sy = 0.0
             sxx = 0.0
@@ -358,6 +408,7 @@ def local_planes(
                     z = m[6] + up * m[0]
                     sw += w * m[0]
                     sww += w * w * m[0]
+                    sn += w * m[10]
                     sx += w * x
                     sy += w * y
                     sxx += w * (m[3] + dx * (m[1] + x))
@@ -388,8 +439,8 @@ def local_planes(
             squares += 2.0 * (a * b * sx + a * d * sy + b * d * sxy)
             heights[row, column] = seed + a
             deviations[row, column] = math.sqrt(max(squares, 0.0) / sw)
-            effective[row, column] = sw * sw / sww
-    return heights, deviations, effective
+            independent[row, column] = max(sw * sw / sww / per_independent, sw / sn)
+    return heights, deviations, independent
 
 
 @njit(nogil=True, cache=True)

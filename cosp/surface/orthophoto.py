@@ -11,6 +11,7 @@ from cosp.geometry.grids import PixelGrid
 from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 from cosp.surface import kernels
+from cosp.surface.nodes import between_nodes
 
 _NODE_CELLS = 32  # the direction to the lens changes by a millionth per metre: linear between such nodes
 
@@ -36,14 +37,11 @@ def direction_to_lens(
         Metres on the map per metre of height; NaN off the film.
     """
     rise_m = 1000.0
-    rows = np.arange(0, grid.shape[0] + _NODE_CELLS, _NODE_CELLS)
-    columns = np.arange(0, grid.shape[1] + _NODE_CELLS, _NODE_CELLS)
+    rows, columns = (np.arange(0, n + _NODE_CELLS, _NODE_CELLS) for n in grid.shape)
     nodes = grid.points(rows[:, None], columns[None, :])
     moved = (locate(film_mm(nodes, 0.0), rise_m) - nodes) / rise_m
-    at = np.meshgrid(
-        np.arange(grid.shape[0]) / _NODE_CELLS, np.arange(grid.shape[1]) / _NODE_CELLS, indexing="ij", sparse=True
-    )
-    east, north = (_bilinear(moved[..., i], at[0][:, 0], at[1][0]) for i in range(2))
+    at = [np.arange(n) / _NODE_CELLS for n in grid.shape]
+    east, north = (between_nodes(moved[..., i], *at) for i in range(2))
     return east, north
 
 
@@ -106,29 +104,49 @@ def sample_film(film: ByteArray, film_grid: PixelGrid, film_mm: FloatArray, hidd
     return np.where(exposed & ~hidden, np.maximum(grey, 1), 0).astype(np.uint8)
 
 
-def fill_heights(heights_m: FloatArray, reference_m: FloatArray) -> Float32Array:
-    """Heights with holes filled from another model, moved by the median difference of the two."""
+def fill_heights(heights_m: FloatArray, reference_m: FloatArray, shift_m: float) -> Float32Array:
+    """Heights with holes filled from another model that is moved by a shift."""
+    return np.where(np.isfinite(heights_m), heights_m, reference_m + shift_m).astype(np.float32)
+
+
+def median_shift(heights_m: FloatArray, reference_m: FloatArray) -> float:
+    """By how much heights lie above those of another model, in the median; 0 where they share nothing."""
     difference = heights_m - reference_m
     known = np.isfinite(difference)
-    shift = float(np.median(difference[known])) if known.any() else 0.0
-    return np.where(np.isfinite(heights_m), heights_m, reference_m + shift).astype(np.float32)
+    return float(np.median(difference[known])) if known.any() else 0.0
 
 
-def heights_on(heights_m: Float32Array, grid: PixelGrid, part: PixelGrid) -> tuple[Window, Float32Array]:
-    """Heights at the cells of another grid, and the window of the model's grid that it lies in.
+def reach_of_occlusion(lowest_m: float, highest_m: float, east: FloatArray, north: FloatArray, grid: PixelGrid) -> int:
+    """Cells over which terrain up to the highest can hide ground from the lowest up, seen along given directions.
 
-    Bilinear; the model's own heights where both grids agree.
+    Parameters
+    ----------
+    lowest_m, highest_m : float
+        Of the ground in question and of all terrain.
+    east, north : arrays
+        From `direction_to_lens`.
     """
+    moved = max(float(np.nanmax(np.abs(a), initial=0.0)) for a in (east, north))
+    return int(np.ceil(max(highest_m - lowest_m, 0.0) * moved / grid.step_x)) + 2
+
+
+def cells_below(grid: PixelGrid, part: PixelGrid) -> Window:
+    """The window of a grid that another one lies in, with a cell about it for what lies between cells."""
     xmin, ymin, xmax, ymax = part.bounds
     rows, columns = grid.pixels(np.array([[xmin, ymax], [xmax, ymin]]))
-    below = Window(
+    return Window(
         int(np.floor(rows.min())) - 1,
         int(np.ceil(rows.max())) + 2,
         int(np.floor(columns.min())) - 1,
         int(np.ceil(columns.max())) + 2,
     ).grown(0, grid.shape)
-    at_rows, at_columns = grid.pixels(part.centres())
-    return below, sample(heights_m, at_rows, at_columns, interpolation="linear", border=np.nan)
+
+
+def heights_on(heights_m: Float32Array, grid: PixelGrid, part: PixelGrid) -> Float32Array:
+    """Heights at the cells of another grid; bilinear, the model's own where both grids agree."""
+    return np.asarray(
+        sample(heights_m, *grid.pixels(part.centres()), interpolation="linear", border=np.nan), np.float32
+    )
 
 
 def nearest_on(values: BoolArray, grid: PixelGrid, part: PixelGrid) -> BoolArray:
@@ -149,13 +167,3 @@ def film_window(film_grid: PixelGrid, film_mm: FloatArray, reach_px: int = 6) ->
         int(np.ceil(min(columns.max(), 1e6))) + reach_px + 1,
     ).grown(0, film_grid.shape)
     return bounds if min(bounds.shape) > 0 else None
-
-
-def _bilinear(values: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
-    """A lattice at fractional rows and columns, which form a grid themselves."""
-    r = np.minimum(rows.astype(int), values.shape[0] - 2)
-    c = np.minimum(columns.astype(int), values.shape[1] - 2)
-    p, q = (rows - r)[:, None], (columns - c)[None, :]
-    upper = values[np.ix_(r, c)] * (1 - q) + values[np.ix_(r, c + 1)] * q
-    lower = values[np.ix_(r + 1, c)] * (1 - q) + values[np.ix_(r + 1, c + 1)] * q
-    return np.asarray(upper * (1 - p) + lower * p)

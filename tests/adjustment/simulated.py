@@ -87,19 +87,30 @@ def conjugates(cameras, rng, count):
 
 
 def simulate_pair(
-    rng, *, name="1112", gcps=1000, ties=2000, distortion_px=0.0, gross_share=0.0, noise=1.0, film_sigma_px=0.0
+    rng,
+    *,
+    name="1112",
+    gcps=1000,
+    ties=2000,
+    distortion_px=0.0,
+    gross_share=0.0,
+    noise=1.0,
+    film_sigma_px=0.0,
+    pixel_mm=PIXEL_MM,
+    cameras=None,
 ):
     """Observations of a pair; every other block of 60 x 27 mm of film is held out as check points.
 
-    `film_sigma_px` is what the observations' sigmas allow for film distortion.
+    `film_sigma_px` is what the observations' sigmas allow for film distortion; `pixel_mm` the pixel that matching noise
+    is measured in; `cameras` take the place of those of the table.
     """
-    cameras = pair(name)
+    cameras = pair(name) if cameras is None else cameras
     distortions = (FilmDistortion(rng, distortion_px), FilmDistortion(rng, distortion_px))
     control, checks, gross = [], [], []
     for camera, distortion in zip(cameras, distortions, strict=True):
         film = film_sample(rng, gcps)
         ground = on_terrain(camera, film) + noise * rng.normal(size=(gcps, 3)) * [GROUND_M, GROUND_M, HEIGHT_M]
-        measured = film + distortion(film) + noise * rng.normal(0.0, MATCH_PX * PIXEL_MM, film.shape)
+        measured = film + distortion(film) + noise * rng.normal(0.0, MATCH_PX * pixel_mm, film.shape)
         wrong = rng.random(gcps) < gross_share
         measured[wrong] += rng.uniform(-150.0, 150.0, (wrong.sum(), 2)) * PIXEL_MM
         held_out = (np.floor(film[:, 0] / 60.0) + np.floor(film[:, 1] / 27.0)) % 2 == 0
@@ -109,7 +120,7 @@ def simulate_pair(
                 Control(
                     film_mm=measured[chosen],
                     ground_m=ground[chosen],
-                    sigma_mm=np.full(count, np.hypot(MATCH_PX, film_sigma_px) * PIXEL_MM),
+                    sigma_mm=np.full(count, np.hypot(MATCH_PX, film_sigma_px) * pixel_mm),
                     sigma_ground_m=np.full(count, GROUND_M),
                     sigma_height_m=np.full(count, HEIGHT_M),
                 )
@@ -117,8 +128,8 @@ def simulate_pair(
         gross.append(wrong[~held_out])
     first, second, _ = conjugates(cameras, rng, ties)
     first_mm, second_mm = (
-        film + distortion(film) + noise * rng.normal(0.0, TIE_PX * PIXEL_MM, film.shape)
+        film + distortion(film) + noise * rng.normal(0.0, TIE_PX * pixel_mm, film.shape)
         for film, distortion in zip((first, second), distortions, strict=True)
     )
-    sigma_mm = np.full(len(first), np.hypot(TIE_PX, film_sigma_px) * PIXEL_MM)
+    sigma_mm = np.full(len(first), np.hypot(TIE_PX, film_sigma_px) * pixel_mm)
     return SimulatedPair(cameras, distortions, control, checks, gross, Ties(0, 1, first_mm, second_mm, sigma_mm))

@@ -37,6 +37,7 @@ OURS = {
     "least_texture_sd": 2.0,
     "saturated_from": 250,
     "least_correlation": 0.35,
+    "least_uniqueness": 0.25,
     "largest_speckle_px": 100,
     "speckle_step_px": 1.5,
     "threads": 1,

@@ -72,8 +72,10 @@ def render(ground, disparity, *, y_parallax=0.0, gain=30.0, gamma=1.0, grain=1.0
 
 
 def errors(pair, found, *, border_px=8):
-    """Disparity errors, of valid pixels that both pictures see, away from the frame; and their share."""
-    wanted = pair.seen.copy()
+    """Disparity errors, of valid pixels that both pictures see, away from the frame of either; and their share."""
+    columns = pair.disparity.shape[1]
+    matched = np.arange(columns) + pair.disparity
+    wanted = pair.seen & (matched >= border_px) & (matched < columns - border_px)
     for edge in (np.s_[:border_px], np.s_[-border_px:], np.s_[:, :border_px], np.s_[:, -border_px:]):
         wanted[edge] = False
     given = wanted & (found.validity == 0)

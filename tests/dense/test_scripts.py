@@ -57,10 +57,11 @@ def test_strips_join_to_what_the_whole_gives(folder, settings):
         strips[::-1], folder / "disparity.tif", folder / "validity.tif", folder / "disparity.json"
     )
     disparity = rasters.read(folder / "disparity.tif")
-    validity, confidence = rasters.read(folder / "validity.tif", band=None)
+    validity, confidence, similarity = rasters.read(folder / "validity.tif", band=None)
     assert disparity.shape == pair.left.shape
     assert_array_equal(np.isnan(disparity), validity != 0)
     assert confidence.dtype == np.uint8
+    assert np.median(similarity[validity == 0]) > 200
     inner = pair.seen.copy()
     inner[:, :20] = inner[:, -30:] = False
     error = (disparity - pair.disparity)[inner & (validity == 0)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from cosp.camera.panoramic import PanoramicCamera
@@ -12,6 +13,7 @@ from cosp.epipolar.correspondences import FilmMapping, virtual_conjugates
 from cosp.epipolar.polynomials import Basis
 from cosp.epipolar.rectification import fit_rectification
 from cosp.geometry.frames import LocalFrame
+from cosp.geometry.grids import PixelGrid
 
 # [Ghuffar2022] table of estimated parameters: longitude, latitude (degrees), height (km); changes (km); angles and
 # changes (degrees); IMC factor. The values are those at the start of the scan.
@@ -75,6 +77,7 @@ def mapping(camera):
 
 
 SEPARABLE = Basis(3, 9)
+FILM_PIXEL_MM = 0.14
 
 
 @functools.cache
@@ -85,3 +88,38 @@ def rectified(fore, aft, *, heights=(0.0, 1000.0, 2000.0, 3000.0), pixel_mm=0.00
     return conjugates, fit_rectification(
         conjugates, films, pixel_mm=pixel_mm, basis=basis, disparity_margin_px=margin_px
     )
+
+
+def film_grid(camera):
+    shape = (round(2 * camera.half_width_mm / FILM_PIXEL_MM), round(2 * camera.half_length_mm / FILM_PIXEL_MM))
+    return PixelGrid(
+        -(shape[1] - 1) / 2 * FILM_PIXEL_MM, (shape[0] - 1) / 2 * FILM_PIXEL_MM, FILM_PIXEL_MM, -FILM_PIXEL_MM, shape
+    )
+
+
+def distortion_mm(film_mm):
+    """What the aft film is displaced by along the scan: 1.5 px rms, changing over some centimetres."""
+    x, y = film_mm[..., 0], film_mm[..., 1]
+    along = 2.0 * FILM_PIXEL_MM * np.sin(x / 11.0 + 0.4) * np.cos(y / 26.0)
+    return np.stack([along + 0.5 * FILM_PIXEL_MM, np.zeros_like(along)], axis=-1)
+
+
+@functools.cache
+def distorted_pair():
+    """Cameras, rectification, and films of level textured ground at 1200 m, the aft one distorted."""
+    rng = np.random.default_rng(11)
+    fore, aft = (replace(camera, half_length_mm=35.0) for camera in table_pair("1112"))
+    _, rectification = rectified(fore, aft, pixel_mm=FILM_PIXEL_MM)
+    texture = sum(
+        cv2.GaussianBlur(rng.standard_normal((1600, 1600)).astype(np.float32), (0, 0), s) * s for s in (1.2, 3.0, 9.0)
+    )
+    texture *= 35 / texture.std()
+    middle = fore.locate(np.zeros(2), 1200.0)[:2]
+    films = []
+    for camera, displacement in ((fore, 0.0), (aft, distortion_mm)):
+        grid = film_grid(camera)
+        imaged = grid.centres() if displacement == 0.0 else grid.centres() - displacement(grid.centres())
+        ground = (camera.locate(imaged, 1200.0)[..., :2] - middle) / 45.0 + 800  # texture of 45 m
+        grey = cv2.remap(texture, *(ground[..., k].astype(np.float32) for k in (0, 1)), cv2.INTER_CUBIC)
+        films.append(np.clip(125 + grey + rng.normal(0, 2, grid.shape), 1, 255).astype(np.uint8))
+    return (fore, aft), rectification, films

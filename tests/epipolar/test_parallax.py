@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from cosp.epipolar.parallax import measure_y_parallax, node_grid
+from cosp.epipolar.patches import image_patches
 from cosp.epipolar.smoothing import local_median, smooth_field
 from cosp.errors import NotEnoughMatchesError
 
@@ -63,9 +64,8 @@ def measured(threads=1, least_score=0.6, bounds=(-140.0, 180.0)):
     fore, aft = synthetic_pair()
     nodes = node_grid(SHAPE, spacing_px=32, fewest_nodes=100)
     return measure_y_parallax(
-        lambda window: fore[window.slices],
-        lambda window: aft[window.slices],
-        SHAPE,
+        image_patches(lambda window: fore[window.slices], SHAPE),
+        image_patches(lambda window: aft[window.slices], SHAPE),
         nodes,
         (np.full(nodes.shape, bounds[0]), np.full(nodes.shape, bounds[1])),
         threads=threads,

@@ -10,17 +10,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from cosp.epipolar.parallax import measure_y_parallax, node_grid
+from cosp.epipolar.patches import image_patches
 from cosp.epipolar.resampling import resample_window
-from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window, tiles
-from tests.epipolar.pairs import rectified, table_pair
-
-PIXEL_MM = 0.14
-
-
-def film_grid(camera):
-    shape = (round(2 * camera.half_width_mm / PIXEL_MM), round(2 * camera.half_length_mm / PIXEL_MM))
-    return PixelGrid(-(shape[1] - 1) / 2 * PIXEL_MM, (shape[0] - 1) / 2 * PIXEL_MM, PIXEL_MM, -PIXEL_MM, shape)
+from tests.epipolar.pairs import FILM_PIXEL_MM, film_grid, rectified, table_pair
 
 
 def rectified_image(film, grid, epipolar_map, shape, tile=100_000, interpolation="cubic"):
@@ -35,7 +28,7 @@ def rectified_image(film, grid, epipolar_map, shape, tile=100_000, interpolation
 @pytest.mark.parametrize("interpolation", ["cubic", "lanczos"])
 def test_grey_values_are_those_of_the_film_at_the_place_of_the_pixel(interpolation):
     fore, aft = table_pair("1112")
-    _, rectification = rectified(fore, aft, pixel_mm=PIXEL_MM)
+    _, rectification = rectified(fore, aft, pixel_mm=FILM_PIXEL_MM)
     grid = film_grid(fore)
 
     def grey(film_mm):
@@ -60,7 +53,7 @@ def test_grey_values_are_those_of_the_film_at_the_place_of_the_pixel(interpolati
 
 def test_the_image_does_not_depend_on_how_it_is_cut(rng):
     fore, aft = table_pair("1117")
-    _, rectification = rectified(fore, aft, pixel_mm=PIXEL_MM)
+    _, rectification = rectified(fore, aft, pixel_mm=FILM_PIXEL_MM)
     grid = film_grid(fore)
     film = cv2.GaussianBlur(rng.integers(0, 255, grid.shape).astype(np.uint8), (0, 0), 1.0)
     whole = rectified_image(film, grid, rectification.fore, (1200, rectification.shape[1]))
@@ -73,7 +66,7 @@ def test_the_image_does_not_depend_on_how_it_is_cut(rng):
 
 def test_a_window_beyond_the_film_is_black():
     fore, aft = table_pair("1112")
-    _, rectification = rectified(fore, aft, pixel_mm=PIXEL_MM)
+    _, rectification = rectified(fore, aft, pixel_mm=FILM_PIXEL_MM)
     grid = film_grid(fore)
     beyond = Window(9000, 9010, 0, 5)
     black = resample_window(
@@ -85,7 +78,7 @@ def test_a_window_beyond_the_film_is_black():
 def test_films_of_textured_ground_come_out_without_y_parallax(rng):
     """From cameras and ground to the epipolar pair: level ground at 1200 m, seen from both stations."""
     fore, aft = (replace(camera, half_length_mm=35.0) for camera in table_pair("1112"))
-    _, rectification = rectified(fore, aft, pixel_mm=PIXEL_MM)
+    _, rectification = rectified(fore, aft, pixel_mm=FILM_PIXEL_MM)
     texture = sum(
         cv2.GaussianBlur(rng.standard_normal((1600, 1600)).astype(np.float32), (0, 0), s) * s for s in (1.2, 3.0, 9.0)
     )
@@ -102,9 +95,7 @@ def test_films_of_textured_ground_come_out_without_y_parallax(rng):
     centres = nodes.centres()
     bounds = rectification.disparity_bounds(centres[..., 1], centres[..., 0])
     result = measure_y_parallax(
-        lambda window: images[0][window.slices],
-        lambda window: images[1][window.slices],
-        rectification.shape,
+        *(image_patches(lambda window, image=image: image[window.slices], image.shape) for image in images),
         nodes,
         bounds,
         template_px=32,

@@ -73,6 +73,19 @@ def test_a_blank_end_moves_the_centre_by_less_than_its_stated_uncertainty(film, 
     assert found.ends_found[1] is (grey == 250)
 
 
+def test_two_dark_ends_are_not_taken_for_the_ends_of_the_format(film):
+    """45 mm of night left, 25 mm right: the picture is too short, and a format from its edge lies off the film."""
+    image = film.image.copy()
+    x_mm = (np.arange(image.shape[1]) - film.centre[0]) * film.pixel_mm
+    night = (x_mm < -LENGTH_MM / 2 + 45) | (x_mm > LENGTH_MM / 2 - 25)
+    image[:, night] = np.minimum(image[:, night], 24)
+    found = _found(film, image)
+    assert found.ends_found == (False, False)
+    x, _ = _centre_error_mm(found, film)
+    assert x < 2.5 * found.centre_sd_mm[0]
+    assert 5.0 < found.centre_sd_mm[0] < 30.0
+
+
 def test_a_film_without_a_format_is_refused():
     noise = np.random.default_rng(0).integers(18, 26, (280, 2900)).astype(np.uint8)
     with pytest.raises(InputError, match="long sides of the format"):

@@ -1,8 +1,5 @@
 import numpy as np
 
-from cosp.geometry.grids import PixelGrid
-from cosp.matching.control import coverage, height_sigma_m, saturated, slope_deg
-from cosp.matching.film_image import FilmImage
 from cosp.matching.filtering import consistent_by_tile, in_check_blocks, thinned
 
 HALF_LENGTH_MM, HALF_WIDTH_MM = 357.4, 27.7
@@ -66,28 +63,3 @@ def test_check_blocks_are_half_of_the_film_and_whole():
     block = np.floor((film_mm / (2 * np.array([HALF_LENGTH_MM, HALF_WIDTH_MM])) + 0.5) * (10, 2))
     for value in np.unique(block, axis=0):
         assert len(np.unique(check[(block == value).all(axis=1)])) == 1
-
-
-def test_coverage_tells_a_full_film_from_one_end():
-    rng = np.random.default_rng(6)
-    film_mm = points(rng, 4000)
-    whole = coverage(film_mm, HALF_LENGTH_MM, HALF_WIDTH_MM, 20, 3)
-    end = coverage(film_mm[film_mm[:, 0] > 286], HALF_LENGTH_MM, HALF_WIDTH_MM, 20, 3)
-    assert (whole["cells"], whole["along"], whole["across"]) == (1.0, 1.0, 1.0)
-    assert (end["along"], end["across"]) == (0.1, 1.0)
-    assert np.sum(whole["counts"]) == 4000
-
-
-def test_slope_of_a_plane_is_its_own_and_makes_heights_uncertain():
-    columns = np.arange(20.0)[None, :] * np.ones((20, 1))
-    slope = slope_deg((30.0 * columns).astype(np.float32), 30.0)
-    np.testing.assert_allclose(slope, 45.0, atol=1e-4)
-    np.testing.assert_allclose(height_sigma_m(np.array([0.0, 45.0]), np.array([3.0, 3.0]), 4.0), [4.0, 5.0])
-
-
-def test_overexposed_snow_is_known():
-    pixels = np.full((100, 400), 120, np.uint8)
-    pixels[:, 200:] = 255
-    film = FilmImage.from_array(pixels, PixelGrid(-20.0, 5.0, 0.1, -0.1, pixels.shape))
-    found = saturated(film, np.array([[-10.0, 0.0], [10.0, 0.0]]), window_mm=0.5, white=252, max_share=0.5)
-    assert found.tolist() == [False, True]

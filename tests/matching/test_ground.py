@@ -166,6 +166,23 @@ def test_a_buffered_film_shows_the_same_and_reads_each_piece_once():
     assert len(windows) == 2
 
 
+@pytest.mark.parametrize(
+    ("turned", "mirrored", "laid"),
+    [(True, False, np.s_[::-1, ::-1]), (False, True, np.s_[::-1, :]), (True, True, np.s_[:, ::-1])],
+)
+def test_a_film_digitised_the_wrong_way_round_shows_the_same_once_it_is_laid_right(turned, mirrored, laid):
+    pixels = np.random.default_rng(0).integers(1, 255, (41, 301)).astype(np.uint8)
+    right = FilmImage.from_array(pixels, PixelGrid(-15.0, 2.0, 0.1, -0.1, pixels.shape))
+    wrong = FilmImage.from_array(np.ascontiguousarray(pixels[laid]), right.grid)
+    points = np.random.default_rng(1).uniform([-14, -1.5], [14, 1.5], (50, 2))
+    film = wrong.laid(turned=turned, mirrored=mirrored)
+    np.testing.assert_allclose(film.sample(points), right.sample(points), atol=0.02)
+    near = points[(points[:, 0] > 2) & (points[:, 0] < 9)]
+    np.testing.assert_allclose(film.part(1.0, 10.0).sample(near), right.sample(near), atol=0.02)
+    assert film.part(1.0, 10.0).grid.shape[1] < 100
+    assert np.nanmax(np.abs(wrong.sample(points) - right.sample(points))) > 10.0
+
+
 def test_film_lattice_runs_along_the_film():
     points = film_lattice(100.0, 20.0, 5, 2)
     assert points.shape == (10, 2)

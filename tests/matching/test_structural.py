@@ -3,6 +3,7 @@ import pytest
 from scipy.ndimage import shift as shift_image
 
 from cosp.errors import InputError
+from cosp.matching.correspondences import Correspondences
 from cosp.matching.ground import lattice_rc
 from cosp.matching.matchers import matcher_by_name, structural
 from cosp.matching.structural import orientation_channels
@@ -94,7 +95,28 @@ def test_sift_finds_a_shift_between_images_that_look_alike():
     np.testing.assert_allclose(np.median(found.fixed_rc - found.moving_rc, axis=0), (4.0, -3.0), atol=0.1)
 
 
-@pytest.mark.parametrize(("name", "message"), [("lightglue", "weights"), ("orb", "not one of")])
+@pytest.mark.parametrize(
+    ("name", "message"), [("lightglue", "not one of"), ("superglue", "superglue_weights"), ("orb", "not one of")]
+)
 def test_a_matcher_that_cannot_be_had_is_refused_by_name(name, message):
     with pytest.raises(InputError, match=message):
         matcher_by_name(name, template_px=49, search_px=12, min_score=0.3, max_ratio=0.9, max_return_px=1.0)
+
+
+def test_rough_matches_are_refined_to_a_fraction_of_a_pixel_and_wrong_ones_left_out():
+    shift = np.array([3.3, -5.7])
+    moving, fixed = pair(shift, noise=10.0)
+    rng = np.random.default_rng(6)
+    points = inner()
+    rough = points + shift + rng.uniform(-1.5, 1.5, points.shape)
+    wrong = np.arange(len(points)) % 3 == 0
+    rough[wrong] += rng.choice([-20.0, 20.0], (wrong.sum(), 2))
+    score = np.where(wrong, 0.9, rng.random(len(points)))
+    given = Correspondences(points, rough, score, np.ones(len(points)))
+    found = matcher().refine(moving, fixed, given, reach_px=4, threads=1)
+    error = found.fixed_rc - found.moving_rc - shift
+    assert np.sqrt((error**2).mean()) < 0.15
+    assert len(found) >= 0.9 * (~wrong).sum()
+    # A match keeps its own score.
+    kept = {tuple(point): s for point, s in zip(points, score, strict=True)}
+    assert [kept[tuple(point)] for point in found.moving_rc] == found.score.tolist()

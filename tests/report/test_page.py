@@ -12,7 +12,15 @@ from matplotlib.figure import Figure
 
 from cosp.dem.tally import Tally
 from cosp.geometry.grids import PixelGrid
-from cosp.report.film import Bending, draw_bending, draw_control, draw_y_parallax
+from cosp.report.film import (
+    Bending,
+    SeamProfile,
+    draw_bending,
+    draw_control,
+    draw_seams,
+    draw_straightness,
+    draw_y_parallax,
+)
 from cosp.report.page import Section, Table, build_page, comparison, flat, picture, readable
 from cosp.report.site import common_grid, draw_tally, library_versions, pair_table
 
@@ -69,6 +77,9 @@ def test_figures_of_films_are_drawn_even_where_nothing_was_found() -> None:
         draw_bending([]),
         draw_control({"s": {"control": np.zeros((3, 2))}, "t": {}}, half_width_mm=28.0),
         draw_y_parallax({"p": empty, "q": np.ones((4, 5000))}),
+        draw_seams([], title="a film of one part"),
+        draw_seams([SeamProfile("a - b", np.empty(0), np.empty((0, 2)), np.empty((0, 2)))], title="nothing seen"),
+        draw_straightness({}, {}, title="neither lines nor holes"),
     ]
     for figure in figures:
         assert picture(figure, "drawn").png.startswith(b"\x89PNG")
@@ -78,6 +89,17 @@ def test_bending_is_drawn_in_micrometres() -> None:
     x = np.linspace(-350, 350, 5)
     (panel,) = draw_bending([Bending("s", "edges", x, np.full(5, 0.25), np.full(5, -0.1))]).axes
     assert panel.lines[0].get_ydata() == pytest.approx(np.full(5, 250.0))
+
+
+def test_steps_and_holes_are_drawn_about_zero() -> None:
+    x = np.arange(5.0)
+    level, steps = np.full((5, 2), 0.7), np.repeat([[0.0, 0.0], [1.0, -1.0]], [2, 3], axis=0)
+    (panel,) = draw_seams([SeamProfile("a - b", x, level + steps, steps)], title="t").axes
+    assert panel.lines[0].get_ydata() == pytest.approx(steps[:, 0])
+    holes = np.column_stack([x, [0.01, -0.01, 0.01, -0.01, 5.0]])
+    top, bottom = draw_straightness({"top": holes * [1, 0]}, {"top": holes}, title="t").axes
+    assert top.lines[1].get_ydata()[:4] == pytest.approx([10.0, -10.0, 10.0, -10.0])
+    assert len(bottom.lines) == 1
 
 
 def test_the_common_grid_covers_every_pair_and_keeps_the_posting() -> None:

@@ -60,6 +60,29 @@ def test_the_stated_standard_deviation_is_that_of_the_heights(rng):
     assert 0.8 < ratio.std() < 1.3
 
 
+def test_surer_points_count_for_more_and_the_standard_deviation_knows(rng):
+    points = scattered(rng)
+    weights = rng.choice([1.0, 0.04], len(points))  # half of the points have five times the noise
+    points[:, 2] += rng.normal(0, 1.5, len(points)) / np.sqrt(weights)
+    inner = (slice(1, -1), slice(1, -1))
+    alike, weighted = (grid_points(points, GRID, **CHOICES, weights=w) for w in (np.ones(len(points)), weights))
+    errors = [(found.height_m - plane(GRID.centres()))[inner] for found in (alike, weighted)]
+    # Equal weights of variances s and 25 s leave 13 s on average, the right ones 1.92 s, as the harmonic mean.
+    assert errors[1].std() < 0.55 * errors[0].std()
+    # The scatter is never believed to be less than the matching noise, so that few points make it a little large.
+    assert 0.7 < (errors[1] / weighted.sigma_m[inner]).std() < 1.2
+
+
+def test_points_without_weight_are_not_there(rng):
+    points = scattered(rng)
+    weights = np.ones(len(points))
+    weights[::3] = 0
+    found = grid_points(points, GRID, **CHOICES, weights=weights)
+    expected = grid_points(points[weights > 0], GRID, **CHOICES)
+    assert np.array_equal(found.height_m, expected.height_m, equal_nan=True)
+    assert np.array_equal(found.count, expected.count)
+
+
 def test_neighbours_that_err_together_make_the_standard_deviation_larger(rng):
     points = scattered(rng)
     alone = grid_points(points, GRID, **CHOICES).sigma_m

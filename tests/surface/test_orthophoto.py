@@ -10,18 +10,26 @@ from cosp.camera.mapping import MapProjector
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.surface.orthophoto import (
+    cells_below,
     direction_to_lens,
     fill_heights,
     film_window,
     heights_on,
     hidden_from_lens,
+    median_shift,
     nearest_on,
+    reach_of_occlusion,
     sample_film,
 )
 from tests.surface.synthetic import ORIGIN, camera, terrain_m, texture
 
 CRS = "EPSG:32632"
 FILM_GRID = PixelGrid(-29.96, 10.0, 0.07, -0.07, (286, 857))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(6)
 
 
 @pytest.fixture(scope="module")
@@ -154,18 +162,36 @@ def test_heights_at_a_finer_posting_lie_on_the_model(grid):
     xy = grid.centres()
     tilted = (0.1 * (xy[..., 0] - grid.x0) + 0.2 * (xy[..., 1] - grid.y0)).astype(np.float32)
     fine = PixelGrid.covering((*xy[30, 40], *(xy[30, 40] + 300)), 5.0)
-    below, heights = heights_on(tilted, grid, fine)
+    below = cells_below(grid, fine)
+    ground = grid.window(below.row0, below.row1, below.column0, below.column1)
+    heights = heights_on(tilted[below.slices], ground, fine)
     at = fine.centres()
     assert_allclose(heights, 0.1 * (at[..., 0] - grid.x0) + 0.2 * (at[..., 1] - grid.y0), atol=0.2)
     marks = np.zeros(below.shape, bool)
-    assert not nearest_on(marks, grid.window(below.row0, below.row1, below.column0, below.column1), fine).any()
-    same, unchanged = heights_on(tilted, grid, grid)
-    assert_allclose(unchanged, tilted, atol=1e-3)
-    assert same.shape == grid.shape
+    assert not nearest_on(marks, ground, fine).any()
+    assert_allclose(heights_on(tilted, grid, grid), tilted, atol=1e-3)
+    assert cells_below(grid, grid).shape == grid.shape
 
 
 def test_holes_are_filled_at_the_level_of_their_surroundings():
     reference = np.arange(100.0).reshape(10, 10)
     ours = (reference + 7).astype(np.float32)
     ours[4:6, 4:6] = np.nan
-    assert_allclose(fill_heights(ours, reference), reference + 7)
+    shift_m = median_shift(ours, reference)
+    assert_allclose(fill_heights(ours, reference, shift_m), reference + 7)
+    assert median_shift(ours[4:6, 4:6], reference[4:6, 4:6]) == 0.0
+
+
+def test_what_lies_within_reach_hides_what_the_whole_terrain_hides(grid, rng):
+    """A part with all that can stand before it gives the marks of the whole."""
+    heights = np.float32(800) * rng.random(grid.shape, np.float32)
+    east, north = np.full(grid.shape, -0.3), np.full(grid.shape, 0.8)
+    whole = hidden_from_lens(heights, Window(0, *grid.shape[:1], 0, grid.shape[1]), grid, east, north, tolerance_m=5.0)
+    part = Window(100, 130, 120, 160)
+    reach = reach_of_occlusion(float(heights[part.slices].min()), float(heights.max()), east, north, grid)
+    assert 20 < reach < 50  # 800 m at 0.8 m per metre, in cells of 25 m
+    around = part.grown(reach, grid.shape)
+    directions = (east[part.slices], north[part.slices])
+    found = hidden_from_lens(heights[around.slices], part.inside(around), grid, *directions, tolerance_m=5.0)
+    assert 0.05 < found.mean() < 0.999
+    assert np.array_equal(found, whole[part.slices])

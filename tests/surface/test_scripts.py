@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from cosp.adjustment.posterior import HeightSigma
 from cosp.camera.mapping import MapProjector
 from cosp.epipolar.correspondences import FilmMapping, virtual_conjugates
 from cosp.epipolar.polynomials import Basis
@@ -59,6 +60,17 @@ def site(tmp_path_factory):
     y_parallax = np.nanmedian(aft_rows - rows)
     disparity += np.random.default_rng(1).normal(0, 0.1, disparity.shape).astype(np.float32)
     disparity[100:103, 200:260] = np.nan
+    # Where matching is unsure it is wrong here, and says so.
+    unsure = np.zeros(disparity.shape, bool)
+    unsure[150:160, 100:250] = True
+    disparity[unsure] += 30.0
+    confidence = np.where(unsure, 20, 255).astype(np.uint8)
+    rasters.write(
+        folder / "validity.tif",
+        np.stack([np.zeros_like(confidence), confidence]),
+        grid=rectification.grid,
+        crs=rasters.PIXEL_CRS,
+    )
     rasters.write(folder / "disparity.tif", disparity, grid=rectification.grid, crs=rasters.PIXEL_CRS)
     nodes = PixelGrid(32.0, 32.0, 64.0, 64.0, tuple(-(-n // 64) for n in rectification.shape))
     bands = np.stack([np.full(nodes.shape, v, np.float32) for v in (0.3, y_parallax, 0.9)])
@@ -66,6 +78,7 @@ def site(tmp_path_factory):
     records.write(folder / "y_parallax.json", {"kind": "y_parallax", "version": 1, "median_px": 0.01, "sd_px": 0.2})
     records.write(folder / "adjustment.json", {"kind": "adjustment", "version": 1, "sigma_naught_px": 1.1})
 
+    records.write(folder / "fore_footprint.json", {"kind": "footprint", "version": 1})
     film_grid = PixelGrid(-28.0 + PIXEL_MM / 2, 27.0 - PIXEL_MM / 2, PIXEL_MM, -PIXEL_MM, (386, 400))
     for look, c in cameras.items():
         seen = to_map.map_from_geodetic(
@@ -96,6 +109,7 @@ def site(tmp_path_factory):
     )
     function("grid_dem")(
         folder / "points.tif",
+        folder / "validity.tif",
         folder / "points.json",
         folder / "dem.tif",
         folder / "dem_sigma.tif",
@@ -103,12 +117,14 @@ def site(tmp_path_factory):
         resolution_m=RESOLUTION_M,
         kernel_cells=0.5,
         gate_sigmas=5.0,
+        least_confidence=40,
         point_sigma_px=0.1,
         points_per_independent=1.0,
         threads=2,
     )
     function("orthorectify")(
         folder / "fore.tif",
+        folder / "fore_footprint.json",
         folder / f"{fore.scene}.json",
         folder / "dem.tif",
         folder / "truth.tif",
@@ -167,6 +183,36 @@ def site(tmp_path_factory):
     return folder
 
 
+def test_the_standard_deviation_of_the_cameras_joins_that_of_matching(site):
+    places = HeightSigma("film", np.array([-30.0, 30.0]), np.array([-30.0, 30.0]), np.array([[2.0, 4.0]] * 2), 1500.0)
+    records.write(site / "height_sigma.json", places)
+    fore = camera("fore", **FILM)
+    function("grid_dem")(
+        site / "points.tif",
+        site / "validity.tif",
+        site / "points.json",
+        site / "dem_again.tif",
+        site / "dem_sigma_again.tif",
+        crs="auto",
+        resolution_m=RESOLUTION_M,
+        kernel_cells=0.5,
+        gate_sigmas=5.0,
+        least_confidence=40,
+        point_sigma_px=0.1,
+        points_per_independent=1.0,
+        threads=1,
+        camera_path=site / f"{fore.scene}.json",
+        height_sigma_path=site / "height_sigma.json",
+    )
+    matching = rasters.read(site / "dem_sigma.tif")
+    both, _, cameras = rasters.read(site / "dem_sigma_again.tif", band=None)
+    assert_allclose(both, np.hypot(matching, cameras), rtol=1e-6)
+    # It grows along the film, which lies nearly along the rows of the map.
+    found = np.nanmedian(cameras[:, np.isfinite(cameras).any(axis=0)], axis=0)
+    assert 2.0 <= found.min() < 2.4
+    assert 3.6 < found.max() <= 4.0
+
+
 def test_the_dem_is_the_terrain_within_its_own_standard_deviation(site):
     info = rasters.info(site / "dem.tif")
     assert info.crs == CRS
@@ -178,6 +224,8 @@ def test_the_dem_is_the_terrain_within_its_own_standard_deviation(site):
     # A tenth of a pixel is 8 m of height; some ten points make a cell.
     assert 1.5 < 1.4826 * np.nanmedian(np.abs(error)) < 4
     assert 0.8 < 1.4826 * np.nanmedian(np.abs(error / sigma)) < 1.3
+    # What matching was unsure of would be 2 km off.
+    assert np.nanmax(np.abs(error)) < 100
     assert np.array_equal(np.isnan(error), np.isnan(sigma))
 
 

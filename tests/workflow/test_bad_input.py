@@ -48,8 +48,8 @@ def _stitch(folder: Path, paths: list[Path], missing: list[str] | None = None, p
     script = runpy.run_path(str(HOME / "scripts" / "stitch.py"))
     script["stitch"](
         [str(path) for path in paths],
-        folder / "results" / "stitched.tif",
         folder / "results" / "seams.json",
+        folder / "results" / "seams.png",
         scene=SCENE,
         missing=missing or [],
         pixel_um=pixel_um,

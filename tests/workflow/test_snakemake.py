@@ -118,6 +118,17 @@ def test_a_given_config_is_not_mixed_with_the_demos(tmp_path: Path) -> None:
     assert "1104-2169_017-023" in done.stdout + done.stderr
 
 
+def test_files_of_a_site_that_is_not_simulated_are_the_users_wherever_they_lie(tmp_path: Path) -> None:
+    settings = _site(tmp_path, pairs=1, pixel_um=140)
+    folder = tmp_path / "resources" / "simulated" / "here"
+    folder.mkdir(parents=True)
+    (tmp_path / "dem.tif").rename(folder / "reference_dem.tif")
+    settings["sites"]["here"]["reference_dem"] = "resources/simulated/here/reference_dem.tif"
+    done = _snakemake("-n", "--configfile", _write(tmp_path, settings), "--directory", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "simulate_site" not in _jobs(done.stdout + done.stderr)
+
+
 def test_the_catalogs_snakefile_is_the_same_workflow(tmp_path: Path) -> None:
     settings = _site(tmp_path, pairs=1, pixel_um=140)
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(HOME / "workflow" / "Snakefile"), "-n"]

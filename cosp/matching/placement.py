@@ -1,0 +1,693 @@
+"""Coarse to fine: where on the ground a film lies, or an error that says why this cannot be known.
+
+The best few places of the first search are followed to finer postings, where the camera is fitted to hundreds of
+independent matches; a place counts only if those agree with one camera in most blocks of the film, and no other place
+does nearly as well.
+"""
+
+from __future__ import annotations
+
+import cmath
+import logging
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from pyproj import Transformer
+
+from cosp.arrays import BoolArray, FloatArray
+from cosp.camera.panoramic import PanoramicCamera
+from cosp.errors import NoOverlapError, PlacementError
+from cosp.geometry.frames import LocalFrame
+from cosp.geometry.rotations import angles_from_matrix, rotation_matrix
+from cosp.geometry.transforms import estimate_affine, ransac
+from cosp.matching.film_image import FilmImage
+from cosp.matching.footprint import FilmBlock, Footprint
+from cosp.matching.ground import (
+    GroundMatches,
+    OnGrid,
+    Terrain,
+    film_lattice,
+    ground_pixel_m,
+    grown,
+    map_bounds,
+    match_film_to_ground,
+    reduction_for,
+)
+from cosp.matching.matchers import structural
+from cosp.matching.refit import refit_camera
+from cosp.matching.relief import Sun, relief_reference, suns
+from cosp.matching.search import (
+    BLOCKS,
+    NOTHING,
+    Candidate,
+    FilmSearch,
+    Found,
+    Prepared,
+    ScoreMap,
+    Way,
+    halved,
+    is_clear,
+    search_widely,
+)
+
+log = logging.getLogger(__name__)
+
+# Candidates followed to a finer posting; others than the first only where they come near it.
+_CANDIDATES = 3
+_NEAR_SHARE = 0.7
+_MIN_BLOCKS = 2
+# A peak so many times higher than the least is followed before other suns are tried.
+_CLEAR = 1.5
+# Suns under which the film is looked for again, together with the image or in all headings and scales.
+_LIKELY_SUNS = 2
+# One posting to the next.
+_LEVEL_RATIO = 3.5
+_TEMPLATE_PX = 81
+_SEARCH_PX = 24
+_TILE_PX = 176
+_STEP_PX = 20
+_TILES_ALONG, _TILES_ACROSS = 24, 3
+# A camera fits any three tiles.
+_MIN_PLACES = 6
+_GATE_PX = 3.0
+# A place is taken without further search where at least this share of the matches agrees.
+_SURE_SHARE = 0.7
+# A film that lies as its camera says gives so many matches a tile; with fewer it is matched again through the fit.
+_MANY = 5.0
+_PASSES = 3
+# Suns of the first search stand 30 degrees apart.
+_SUN_CHANGE_DEG = 15.0
+
+
+@dataclass(frozen=True)
+class Located:
+    """A frame that has been placed, or why it has not, and the maps of scores of the first search.
+
+    Parameters
+    ----------
+    footprint : Footprint or None
+    refusal : str or None
+        The evidence, where it does not place the film.
+    maps : ScoreMap of each way the film may lie
+    """
+
+    footprint: Footprint | None
+    refusal: str | None
+    maps: tuple[ScoreMap, ...]
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Something to compare the film with."""
+
+    name: str
+    on_grid: OnGrid
+    sun: Sun | None = None
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """A candidate of the first search and what spoke for it."""
+
+    candidate: Candidate
+    evidence: tuple[_Evidence, ...]
+
+    def __str__(self) -> str:
+        east, north = self.candidate.shift_m / 1000
+        view = self.candidate.view
+        names = " and ".join(e.name for e in self.evidence)
+        return (
+            f"{self.candidate.score:.1f} by {names}: {east:+.1f} km east, {north:+.1f} km north, {view.way}, "
+            f"{math.degrees(view.rotation):+.1f} deg, {100 * view.scale:+.1f} %"
+        )
+
+
+@dataclass(frozen=True)
+class _Placement:
+    """A candidate followed to a finer posting."""
+
+    camera: PanoramicCamera
+    crs: str
+    matches: GroundMatches
+    agreeing: BoolArray
+    posting_m: float
+    residual_m: float
+
+    @property
+    def share(self) -> float:
+        return float(self.agreeing.mean()) if len(self.agreeing) else 0.0
+
+    @property
+    def support(self) -> float:
+        """Sum of the scores of the matches that agree."""
+        return float(self.matches.score[self.agreeing].sum())
+
+    def places(self) -> int:
+        """Tiles with matches that agree; those of one tile share most of their pixels and are one piece of evidence."""
+        half = np.array([self.camera.half_length_mm, self.camera.half_width_mm])
+        cells = np.floor((self.matches.film_mm[self.agreeing] / half + 1) / 2 * [_TILES_ALONG, _TILES_ACROSS])
+        return len(np.unique(cells, axis=0))
+
+    def blocks(self) -> tuple[FilmBlock, ...]:
+        half = self.camera.half_length_mm
+        index = np.clip(((self.matches.film_mm[:, 0] + half) / (2 * half) * BLOCKS).astype(int), 0, BLOCKS - 1)
+        centres = film_lattice(half, 1.0, BLOCKS, 1)[:, 0]
+        return tuple(
+            FilmBlock(float(x), int((index == i).sum()), int((self.agreeing & (index == i)).sum()))
+            for i, x in enumerate(centres)
+        )
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """What a placement needs to be believed."""
+
+    min_agreeing: int
+    min_share: float
+    min_block_share: float
+
+    def fault(self, placement: _Placement) -> str | None:
+        """Why the matches do not support a placement; None if they do."""
+        agreeing, count = int(placement.agreeing.sum()), len(placement.agreeing)
+        blocks = [block for block in placement.blocks() if block.matches >= 3]
+        good = sum(block.agreeing >= max(3, 0.5 * self.min_share * block.matches) for block in blocks)
+        share = good / len(blocks) if blocks else 0.0
+        if (
+            agreeing >= self.min_agreeing
+            and placement.share >= self.min_share
+            and share >= self.min_block_share
+            and good >= _MIN_BLOCKS
+            and placement.places() >= _MIN_PLACES
+        ):
+            return None
+        return (
+            f"{agreeing} of {count} matches at {placement.posting_m:.0f} m agree with one camera, at "
+            f"{placement.places()} places of the film and in {good} of {len(blocks)} blocks; needed are "
+            f"{self.min_agreeing} matches, {self.min_share:.0%} of all, at {_MIN_PLACES} places and in "
+            f"{self.min_block_share:.0%} of the blocks"
+        )
+
+
+def locate_film(
+    film: FilmImage,
+    predicted: PanoramicCamera,
+    *,
+    reference_on: OnGrid | None,
+    heights_on: OnGrid,
+    day: date | None,
+    crs: str,
+    search_m: float,
+    coarse_posting_m: float,
+    fine_posting_m: float,
+    min_score: float,
+    min_margin: float,
+    min_agreeing: int,
+    min_agreeing_share: float,
+    min_block_share: float,
+    rng: np.random.Generator,
+    threads: int,
+) -> Located:
+    """The place of a film on the ground, from a prediction that may be far off, or why it cannot be known.
+
+    Parameters
+    ----------
+    film : FilmImage
+        Which way round it lies is found.
+    predicted : PanoramicCamera
+    reference_on : function of a PixelGrid, or None
+        Reference image on a map grid, NaN outside. Where there is none, or it does not place the film beyond doubt, the
+        shaded relief of `heights_on` is evidence too.
+    heights_on : function of a PixelGrid
+        Ellipsoidal heights, NaN outside.
+    day : date, optional
+        When the film was exposed, for the place of the sun.
+    crs : str
+        Map projection in metres to work in.
+    search_m : float
+        Largest error of the predicted place, in each direction.
+    coarse_posting_m, fine_posting_m : float
+        First and last posting; the last is not finer than the film.
+    min_score : float
+        Least height of the peak of the whole search above its surroundings, in standard deviations.
+    min_margin : float
+        Least ratio of agreeing matches to those of the best other candidate.
+    min_agreeing, min_agreeing_share : int, float
+        Least number and share of matches that agree with one camera.
+    min_block_share : float
+        Least share of the film's blocks with matches in which most of them agree.
+    rng : numpy Generator
+    threads : int
+    """
+    pixel_m = ground_pixel_m(predicted, film.pixel_mm, 0.0)
+    last_m = max(fine_posting_m, pixel_m)
+    finest = film.reduced(reduction_for(last_m, pixel_m))
+    finest_m = pixel_m * finest.pixel_mm / film.pixel_mm
+    last_heights_on = lru_cache(1)(heights_on)  # one grid under many suns
+    found, refusal = NOTHING, ""
+    try:
+        terrain = Terrain.on(heights_on, grown(map_bounds(predicted, crs), search_m), crs, coarse_posting_m)
+        follower = _Follower(
+            finest, finest_m, predicted, terrain, heights_on,
+            _Limits(min_agreeing, min_agreeing_share, min_block_share), rng, threads,
+        )  # fmt: skip
+        stages = _stages(
+            finest.reduced(reduction_for(coarse_posting_m, finest_m)),
+            predicted,
+            terrain,
+            image=None if reference_on is None else _Evidence("image", reference_on),
+            reliefs=[
+                _Evidence("relief", relief_reference(last_heights_on, *sun), sun)
+                for sun in suns(day, predicted.origin.latitude_deg)
+            ],
+            search_m=search_m,
+            posting_m=coarse_posting_m,
+            clear=_CLEAR * min_score,
+            threads=threads,
+        )
+        for guesses, found, last in stages:
+            for guess in guesses[:4]:
+                log.info("place of the whole search: %s", guess)
+            try:
+                footprint = follower.footprint(
+                    guesses, _postings(coarse_posting_m, last_m),
+                    found=found, min_score=min_score, min_margin=min_margin, last=last,
+                )  # fmt: skip
+            except PlacementError as doubt:
+                refusal = str(doubt)
+                log.info("%s", refusal)
+            else:
+                return Located(footprint, None, found.maps)
+    except NoOverlapError as nothing:
+        refusal = str(nothing)
+    log.warning("%s", refusal)
+    return Located(None, refusal, found.maps)
+
+
+def score_in_window(min_score: float, search_m: float, window_m: float) -> float:
+    """The score that chance reaches as seldom in a smaller window as `min_score` in the whole one.
+
+    The highest of n independent standard normal values grows as the root of 2 log n.
+    """
+    gain = 4 * math.log(max(search_m / window_m, 1.0))  # twice the log of the ratio of the areas
+    return math.sqrt(max(min_score**2 - gain, 0.25 * min_score**2))
+
+
+@dataclass(frozen=True)
+class _Follower:
+    """Follows places of the first search to finer postings."""
+
+    film: FilmImage
+    pixel_m: float
+    predicted: PanoramicCamera
+    terrain: Terrain
+    heights_on: OnGrid
+    limits: _Limits
+    rng: np.random.Generator
+    threads: int
+    followed: dict[tuple[int, int], _Placement | None] = field(default_factory=dict)
+
+    def footprint(
+        self,
+        guesses: Sequence[_Guess],
+        postings: Sequence[float],
+        *,
+        found: Found,
+        min_score: float,
+        min_margin: float,
+        last: bool,
+    ) -> Footprint:
+        """The one place that the film's own matches agree on.
+
+        While more evidence is to come (`last` is not set) only a place on which most of them agree is taken.
+
+        Raises
+        ------
+        PlacementError
+            If no place stands out; says what was found.
+        """
+        head = f"{self.predicted.scene}: cannot be placed: "
+        if not guesses:
+            raise PlacementError(
+                f"{head}fewer than {_MIN_BLOCKS} blocks of the film hold texture and find ground to compare with"
+            )
+        score = guesses[0].candidate.score
+        if score < min_score:
+            raise PlacementError(
+                f"{head}the highest correlation peak stands {score:.1f} standard deviations above its surroundings, "
+                f"{min_score:.1f} are needed"
+            )
+        tried = self._tried(guesses, postings[0])
+        if not tried:
+            raise PlacementError(f"{head}no candidate of the search lies on the reference DEM")
+        best, evidence, placement = tried[0]
+        way = best.candidate.view.way
+        rivals = [_against(other, placement, same_way=guess.candidate.view.way == way) for guess, _, other in tried[1:]]
+        margin = float(placement.agreeing.sum() / max([1, *rivals]))
+        placement = self._settled(way, evidence, placement)
+        limits = self.limits if last else replace(self.limits, min_share=max(self.limits.min_share, _SURE_SHARE))
+        fault = limits.fault(placement)
+        if fault is not None:
+            raise PlacementError(head + fault)
+        if margin < min_margin:
+            raise PlacementError(
+                f"{head}{int(placement.agreeing.sum())} matches agree with one place and {max(rivals)} with another; "
+                f"the first must have {min_margin:.1f} times as many"
+            )
+        evidence, placement = self._under_the_best_sun(way, evidence, placement)
+        for posting in postings[1:]:
+            finer = self._placed(way, placement.camera, evidence, posting)
+            log.info("%d of %d matches agree at %.1f m", finer.agreeing.sum(), len(finer.agreeing), posting)
+            fault = self.limits.fault(finer)
+            if fault is not None:  # the place is known; how well is what the last posting says
+                log.warning("the film stays as it was placed at %.0f m: %s", placement.posting_m, fault)
+                break
+            placement = finer
+        return self._record(best.candidate, evidence, placement, found.rival_score(best.candidate), margin)
+
+    def _tried(self, guesses: Sequence[_Guess], posting_m: float) -> list[tuple[_Guess, _Evidence, _Placement]]:
+        """The best few places at the next posting, the one with most agreeing matches first."""
+        tried: list[tuple[_Guess, _Evidence, _Placement]] = []
+        for guess in guesses[:_CANDIDATES]:
+            far_behind = guess.candidate.score < _NEAR_SHARE * guesses[0].candidate.score
+            if far_behind and any(self.limits.fault(placement) is None for *_, placement in tried):
+                break
+            for evidence in guess.evidence:
+                placement = self._followed(guess, evidence, posting_m)
+                if placement is not None:
+                    tried.append((guess, evidence, placement))
+        return sorted(tried, key=lambda one: -int(one[2].agreeing.sum()))
+
+    def _followed(self, guess: _Guess, evidence: _Evidence, posting_m: float) -> _Placement | None:
+        """One place at the next posting; None where there is no ground."""
+        key = (id(guess.candidate), id(evidence))
+        if key not in self.followed:  # a place may come up again after the next stage
+            placement: _Placement | None = None
+            try:
+                camera = _camera_of(guess.candidate, self.predicted, self.terrain)
+                placement = self._placed(guess.candidate.view.way, camera, evidence, posting_m)
+                log.info(
+                    "%s: %d of %d matches with the %s agree at %.0f m",
+                    guess, placement.agreeing.sum(), len(placement.agreeing), evidence.name, posting_m,
+                )  # fmt: skip
+            except NoOverlapError:  # a wrong candidate may lead anywhere
+                log.info("%s: no ground there", guess)
+            self.followed[key] = placement
+        return self.followed[key]
+
+    def _settled(self, way: Way, evidence: _Evidence, placement: _Placement) -> _Placement:
+        """The same place matched again through its fitted camera, while that brings matches that agree."""
+        for _ in range(_PASSES):
+            if placement.agreeing.sum() > _MANY * len(_tiles(placement.camera, placement.posting_m)):
+                break
+            again = self._placed(way, placement.camera, evidence, placement.posting_m)
+            if again.support <= 1.05 * placement.support:
+                break
+            placement = again
+        return placement
+
+    def _under_the_best_sun(self, way: Way, evidence: _Evidence, placement: _Placement) -> tuple[_Evidence, _Placement]:
+        """Relief under the sun itself or one beside it, whichever the film matches best."""
+        if evidence.sun is None:
+            return evidence, placement
+        best = evidence, placement
+        for change in (-_SUN_CHANGE_DEG, _SUN_CHANGE_DEG):
+            sun = Sun((evidence.sun.azimuth_deg + change) % 360.0, evidence.sun.elevation_deg)
+            other = _Evidence(evidence.name, relief_reference(self.heights_on, *sun), sun)
+            found = self._placed(way, placement.camera, other, placement.posting_m)
+            if found.support > best[1].support and self.limits.fault(found) is None:
+                best = other, found
+        return best
+
+    def _placed(self, way: Way, camera: PanoramicCamera, evidence: _Evidence, posting_m: float) -> _Placement:
+        laid = self.film.laid(turned=way.turned, mirrored=way.mirrored)
+        level = laid.reduced(reduction_for(posting_m, self.pixel_m))
+        return _placed(
+            level, camera, evidence.on_grid, self.heights_on, self.terrain.crs, posting_m, self.rng, self.threads
+        )
+
+    def _record(
+        self, candidate: Candidate, evidence: _Evidence, placement: _Placement, rival_score: float, margin: float
+    ) -> Footprint:
+        camera, height = placement.camera, self.terrain.mean_m
+        shift = shift_m(self.predicted, camera, height)
+        before, after = (
+            complex(*(c.locate(np.array([50.0, 0.0]), height) - c.locate(np.array([-50.0, 0.0]), height))[:2])
+            for c in (self.predicted, camera)
+        )
+        turn_deg, scale = math.degrees(cmath.phase(after / before)), abs(after / before)
+        sun = evidence.sun or suns(None, 0.0)[0]  # an image has none
+        return Footprint(
+            scene=self.predicted.scene,
+            camera=camera,
+            shift_east_m=shift[0],
+            shift_north_m=shift[1],
+            turned=candidate.view.way.turned,
+            mirrored=candidate.view.way.mirrored,
+            rotation_deg=turn_deg,
+            scale=scale,
+            score=float(candidate.score),
+            rival_score=float(rival_score),
+            margin=margin,
+            agreeing_share=placement.share,
+            residual_m=placement.residual_m,
+            sigma_m=placement.residual_m,
+            posting_m=placement.posting_m,
+            reference=evidence.name,
+            sun_azimuth_deg=sun.azimuth_deg,
+            sun_elevation_deg=sun.elevation_deg,
+            corners_lonlat=corners_lonlat(camera, height),
+            blocks=placement.blocks(),
+        )
+
+
+def shift_m(before: PanoramicCamera, after: PanoramicCamera, height_m: float) -> tuple[float, float]:
+    """East and north from the middle of one film on the ground to that of another."""
+    first, second = (c.origin.ecef_from_local(c.locate(np.zeros(2), height_m)) for c in (before, after))
+    moved = (second - first) @ before.origin.axes.T
+    return float(moved[0]), float(moved[1])
+
+
+def corners_lonlat(camera: PanoramicCamera, height_m: float) -> tuple[tuple[float, float], ...]:
+    """Longitude and latitude of a picture's corners: (-x, +y), (+x, +y), (+x, -y), (-x, -y)."""
+    half = np.array([camera.half_length_mm, camera.half_width_mm])
+    corners = camera.locate_geodetic(np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * half, height_m)
+    return tuple((float(lon), float(lat)) for lon, lat, _ in corners)
+
+
+def _stages(
+    film: FilmImage,
+    predicted: PanoramicCamera,
+    terrain: Terrain,
+    *,
+    image: _Evidence | None,
+    reliefs: Sequence[_Evidence],
+    search_m: float,
+    posting_m: float,
+    clear: float,
+    threads: int,
+) -> Iterator[tuple[list[_Guess], Found, bool]]:
+    """Places of the first search, best first, after each stage, and whether it was the last: cheap stages come first.
+
+    The image in about the predicted heading, in every heading; the relief under one sun after another, together with
+    the image; the relief in every heading.
+
+    Raises
+    ------
+    NoOverlapError
+        If there is nothing to compare with within the search window.
+    """
+    height, crs = terrain.mean_m, terrain.crs
+    fine = FilmSearch(
+        film, predicted, height_m=height, crs=crs, posting_m=posting_m, search_m=search_m, threads=threads
+    )
+    coarse = FilmSearch(
+        film.reduced(2), predicted, height_m=height, crs=crs, posting_m=2 * posting_m, search_m=search_m,
+        threads=threads, grid=fine.grid.coarsened(2),
+    )  # fmt: skip
+    guesses: list[_Guess] = []
+    everything = NOTHING
+
+    def seen_by(evidence: _Evidence) -> tuple[_Evidence, Prepared, Prepared]:
+        raster = evidence.on_grid(fine.grid)
+        if not np.isfinite(raster).any():
+            area = ", ".join(f"{v:.0f}" for v in fine.grid.bounds)
+            raise NoOverlapError(
+                f"{predicted.scene}: the reference {evidence.name} holds nothing within ({area}) m of {crs}, where the "
+                "film was looked for"
+            )
+        return evidence, fine.prepared(raster), coarse.prepared(halved(raster))
+
+    def look(*sources: tuple[_Evidence, Prepared, Prepared], widely: bool = False) -> float:
+        nonlocal everything
+        evidence, close, rough = zip(*sources, strict=True)
+        found = search_widely(fine, coarse, close, rough) if widely else fine.run(close, fine.narrow_views())
+        guesses.extend(_Guess(candidate, evidence) for candidate in found.candidates)
+        everything = everything.and_more(found)
+        return max((candidate.score for candidate in found.candidates), default=0.0)
+
+    def so_far(*, last: bool = False) -> tuple[list[_Guess], Found, bool]:
+        kept: list[_Guess] = []
+        for guess in sorted(guesses, key=lambda guess: -guess.candidate.score):
+            if not any(guess.candidate.is_like(other.candidate) for other in kept):
+                kept.append(guess)
+        return kept, everything, last
+
+    pictures = []
+    if image is not None:
+        try:
+            pictures.append(seen_by(image))
+        except NoOverlapError as nothing:
+            log.warning("%s; the relief remains", nothing)
+    if pictures:
+        look(*pictures)
+        yield so_far()
+        look(*pictures, widely=True)
+        yield so_far()
+    scores: list[tuple[float, _Evidence]] = []
+    for relief in reliefs:
+        scores.append((look(seen_by(relief)), relief))
+        if is_clear(everything, clear):
+            yield so_far()
+    likely = [relief for _, relief in sorted(scores, key=lambda one: -one[0])[:_LIKELY_SUNS]]
+    if pictures:
+        for relief in likely:
+            look(*pictures, seen_by(relief))
+    yield so_far()
+    for relief in likely:
+        look(*pictures, seen_by(relief), widely=True)
+    yield so_far(last=True)
+
+
+def _postings(coarse_m: float, last_m: float) -> list[float]:
+    """Postings after the first search, each finer than the last by about the same ratio."""
+    count = max(1, round(math.log(max(coarse_m / last_m, 1.0)) / math.log(_LEVEL_RATIO)))
+    return [float(coarse_m * (last_m / coarse_m) ** ((i + 1) / count)) for i in range(count)]
+
+
+def _against(other: _Placement, best: _Placement, *, same_way: bool) -> int:
+    """How many matches that agree with another placement contradict the best one.
+
+    A candidate that is right at one end of the film agrees there with the right one, and is no rival.
+    """
+    chosen = other.agreeing
+    if not chosen.any() or not same_way:
+        return int(chosen.sum())
+    ground = best.camera.origin.local_from_geodetic(other.matches.lonlath(best.crs)[chosen])
+    distance = np.linalg.norm(other.matches.film_mm[chosen] - best.camera.project(ground), axis=1)
+    gate_mm = 2 * _GATE_PX * best.posting_m * _film_mm_per_m(best.camera, 0.0)
+    return int((~(distance <= gate_mm)).sum())
+
+
+def _camera_of(candidate: Candidate, predicted: PanoramicCamera, terrain: Terrain) -> PanoramicCamera:
+    """The predicted camera turned, scaled and moved to a candidate's place and fitted to its blocks, in its frame."""
+    film_mm = np.column_stack([candidate.x_mm, np.zeros_like(candidate.x_mm)])
+    smooth = replace(
+        terrain,
+        heights_m=np.asarray(cv2.blur(terrain.heights_m, (41, 41), borderType=cv2.BORDER_REPLICATE), np.float32),
+    )
+    height = smooth.at(candidate.found_m)
+    to_geodetic = Transformer.from_crs(terrain.crs, "EPSG:4326", always_xy=True)
+    lon, lat = to_geodetic.transform(candidate.found_m[:, 0], candidate.found_m[:, 1])
+
+    turned = turned_about_centre(predicted, candidate.view.rotation, 1 + candidate.view.scale, terrain.mean_m)
+    # The whole camera is carried over the ellipsoid, so that it keeps its height and its tilt.
+    start, end = candidate.predicted_m.mean(axis=0), candidate.found_m.mean(axis=0)
+    lon_change, lat_change = np.subtract(to_geodetic.transform(*end), to_geodetic.transform(*start))
+    moved = replace(
+        turned,
+        origin=LocalFrame(
+            turned.origin.longitude_deg + float(lon_change), turned.origin.latitude_deg + float(lat_change)
+        ),
+    )
+    ground = moved.origin.local_from_geodetic(np.column_stack([lon, lat, height]))
+    # A block is one template, so its place is known to about a pixel of the coarse posting.
+    sigma_mm = np.full(len(film_mm), _film_mm_per_m(moved, terrain.mean_m) * terrain.grid.step_x * 1.5)
+    return refit_camera(moved, film_mm, ground, sigma_mm).camera.moved_to(predicted.origin)
+
+
+def turned_about_centre(camera: PanoramicCamera, rotation: float, scale: float, height_m: float) -> PanoramicCamera:
+    """The camera whose film shows the ground turned (radians, counter-clockwise) and scaled about its middle."""
+    p = camera.parameters()
+    c, s = math.cos(rotation), math.sin(rotation)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    middle = camera.locate(np.zeros(2), height_m)
+    angles = [angles_from_matrix(rotation_matrix(p[6:9] + tau * p[9:12]) @ turn.T) for tau in (-0.5, 0.0, 0.5)]
+    position = middle + scale * turn @ (p[0:3] - middle)
+    change = np.angle(np.exp(1j * (angles[2] - angles[0])))
+    return camera.with_parameters(np.concatenate([position, scale * turn @ p[3:6], angles[1], change, p[12:]]))
+
+
+def _film_mm_per_m(camera: PanoramicCamera, height_m: float) -> float:
+    return 1.0 / ground_pixel_m(camera, 1.0, height_m)
+
+
+def _tiles(camera: PanoramicCamera, posting_m: float) -> FloatArray:
+    """Film points about which tiles of a posting are matched."""
+    width_m = 2 * camera.half_width_mm / _film_mm_per_m(camera, 0.0)
+    rows = int(np.clip(round(width_m / posting_m / 150), 1, _TILES_ACROSS))
+    return film_lattice(camera.half_length_mm, camera.half_width_mm, _TILES_ALONG, rows)
+
+
+def _placed(
+    film: FilmImage,
+    camera: PanoramicCamera,
+    reference_on: OnGrid,
+    heights_on: OnGrid,
+    crs: str,
+    posting_m: float,
+    rng: np.random.Generator,
+    threads: int,
+) -> _Placement:
+    """A camera fitted to matches at a posting, and which of them agree with it."""
+    mm_per_m = _film_mm_per_m(camera, 0.0)
+    terrain = Terrain.on(heights_on, map_bounds(camera, crs), crs, max(posting_m, 200.0))
+    matches = match_film_to_ground(
+        film,
+        camera,
+        _tiles(camera, posting_m),
+        reference_on=reference_on,
+        heights_on=heights_on,
+        terrain=terrain,
+        # Scores and ratios are lax here: agreement with one camera decides.
+        matcher=structural(_TEMPLATE_PX, _SEARCH_PX, 0.1, 0.97, 1.5),
+        posting_m=posting_m,
+        tile_px=_TILE_PX,
+        step_px=_STEP_PX,
+        margin_px=_TEMPLATE_PX // 2 + _SEARCH_PX,
+        threads=threads,
+    )
+    nothing = np.zeros(len(matches), bool)
+    if len(matches) < 6:
+        return _Placement(camera, crs, matches, nothing, posting_m, float("nan"))
+    ground = camera.origin.local_from_geodetic(matches.lonlath(crs))
+    pixel_mm = mm_per_m * posting_m
+    predicted = camera.project(ground)
+    seen = np.isfinite(predicted).all(axis=1)
+    _, first = ransac(
+        estimate_affine,
+        predicted[seen],
+        matches.film_mm[seen],
+        minimum=3,
+        gate=2 * _GATE_PX * pixel_mm,
+        trials=400,
+        rng=rng,
+    )
+    agreeing = nothing.copy()
+    agreeing[seen] = first
+    if agreeing.sum() < 6:
+        return _Placement(camera, crs, matches, nothing, posting_m, float("nan"))
+    fitted = camera
+    distance = np.full(len(matches), np.inf)
+    for _ in range(3):
+        sigma = np.full(int(agreeing.sum()), pixel_mm)
+        fitted = refit_camera(fitted, matches.film_mm[agreeing], ground[agreeing], sigma, prior=camera).camera
+        distance = np.nan_to_num(np.linalg.norm(matches.film_mm - fitted.project(ground), axis=1), nan=np.inf)
+        agreeing = distance <= _GATE_PX * pixel_mm
+        if agreeing.sum() < 6:
+            return _Placement(camera, crs, matches, agreeing, posting_m, float("nan"))
+    return _Placement(fitted, crs, matches, agreeing, posting_m, float(np.median(distance[agreeing]) / mm_per_m))

@@ -1,0 +1,117 @@
+"""Settle where a frame lies: as it was found by itself, or, where it was not, with the help of its neighbours."""
+
+import logging
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+
+from cosp.camera.panoramic import PanoramicCamera
+from cosp.errors import PlacementError
+from cosp.io import rasters, records, references
+from cosp.io.logs import log_to
+from cosp.matching.film_image import FilmImage
+from cosp.matching.footprint import Attempt
+from cosp.matching.ground import Terrain, grown, map_bounds, map_crs
+from cosp.matching.neighbours import PlacedFrame, expected_frame
+from cosp.matching.placement import locate_film, score_in_window, shift_m
+from cosp.sheets import parse_scene_id
+
+
+def place_frame(
+    placement_path,
+    others_paths,
+    film_path,
+    camera_path,
+    reference_dem_path,
+    reference_image_path,
+    footprint_path,
+    *,
+    day,
+    reference_dem_heights,
+    search_km,
+    coarse_posting_m,
+    fine_posting_m,
+    min_score,
+    min_margin,
+    min_agreeing,
+    min_agreeing_share,
+    min_block_share,
+    seed,
+    threads,
+):
+    log = logging.getLogger("place_frame")
+    attempt = records.read(placement_path, Attempt)
+    if attempt.footprint is not None:
+        records.write(footprint_path, attempt.footprint)
+        return
+    camera = records.read(camera_path, PanoramicCamera)
+    expected = neighbours_say(camera, [records.read(path, Attempt) for path in others_paths])
+    if expected is None:
+        raise PlacementError(f"{attempt.refusal}; no other frame of its pass has been placed to say where it must lie")
+    window_m = max(3.0 * expected.sigma_m, 10 * coarse_posting_m)
+    log.info("%s; %s place it to %.0f m", attempt.refusal, ", ".join(expected.neighbours), expected.sigma_m)
+    crs = map_crs(expected.camera)
+    heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
+    located = locate_film(
+        FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window)),
+        expected.camera,
+        reference_on=references.image_on(reference_image_path, crs) if reference_image_path else None,
+        heights_on=heights_on,
+        day=date.fromisoformat(day) if day else None,
+        crs=crs,
+        search_m=window_m,
+        coarse_posting_m=coarse_posting_m,
+        fine_posting_m=fine_posting_m,
+        min_score=score_in_window(min_score, 1000.0 * search_km, window_m),
+        min_margin=min_margin,
+        min_agreeing=min_agreeing,
+        min_agreeing_share=min_agreeing_share,
+        min_block_share=min_block_share,
+        rng=np.random.default_rng(seed),
+        threads=threads,
+    )
+    height_m = Terrain.on(heights_on, grown(map_bounds(expected.camera, crs), window_m), crs, 1000.0).mean_m
+    if located.footprint is None:
+        log.warning("%s", located.refusal)
+        footprint = expected.footprint(camera, height_m)
+    else:
+        east, north = shift_m(camera, located.footprint.camera, height_m)
+        footprint = replace(located.footprint, shift_east_m=east, shift_north_m=north, neighbours=expected.neighbours)
+    records.write(footprint_path, footprint)
+
+
+def neighbours_say(camera, attempts):
+    """Where the placed frames of a camera's pass leave room for it."""
+    own = parse_scene_id(camera.scene)
+    placed = []
+    for attempt in attempts:
+        other = parse_scene_id(attempt.scene)
+        if attempt.footprint is not None and (other.flight, other.descending) == (own.flight, own.descending):
+            placed.append(PlacedFrame(int(other.frame), other.look, attempt.footprint))
+    return expected_frame(camera, int(own.frame), own.look, placed)
+
+
+if __name__ == "__main__":
+    with log_to(snakemake.log[0]):
+        place_frame(
+            placement_path=snakemake.input.placement,
+            others_paths=list(snakemake.input.others),
+            film_path=snakemake.input.film,
+            camera_path=snakemake.input.camera,
+            reference_dem_path=snakemake.input.reference_dem,
+            reference_image_path=snakemake.input.get("reference_image"),
+            footprint_path=snakemake.output.footprint,
+            day=snakemake.params.day,
+            reference_dem_heights=snakemake.params.reference_dem_heights,
+            search_km=snakemake.params.search_km,
+            coarse_posting_m=snakemake.params.coarse_posting_m,
+            fine_posting_m=snakemake.params.fine_posting_m,
+            min_score=snakemake.params.min_score,
+            min_margin=snakemake.params.min_margin,
+            min_agreeing=snakemake.params.min_agreeing,
+            min_agreeing_share=snakemake.params.min_agreeing_share,
+            min_block_share=snakemake.params.min_block_share,
+            seed=snakemake.params.seed,
+            threads=snakemake.threads,
+        )

@@ -1,0 +1,119 @@
+"""Plain model against film fields, from noisy observations of a pair with known truth: the table of docs/adjustment.md.
+
+    python -m tests.benchmarks.adjustment [--seed 1] [case ...]
+
+The truth are cameras of the published parameter table; film distortion is a Gaussian random field (200 waves), no sum
+of splines. Control: 3 m per horizontal axis, 4 m in height, 0.7 px; 6000 tie points of 0.4 px; reference heights of
+4 m, white over cells of 300 m. Start cameras are off by 5 km and, in velocity, attitude and rates, by what the priors
+say. Errors are those of the model: noise-free points all over the overlap, intersected, against the truth.
+"""
+
+import argparse
+import time
+from dataclasses import fields, replace
+
+import numpy as np
+
+from cosp.adjustment.blocks import orient_block
+from cosp.adjustment.calibration import FieldChoices
+from cosp.adjustment.observations import Control
+from cosp.adjustment.rows import intersections, tie_rows
+from tests.adjustment.simulated import HALF_LENGTH_MM, conjugates, simulate_pair
+from tests.adjustment.test_calibration import reference
+from tests.authorities.parameter_table import PIXEL_MM, pair
+
+CASES = {
+    "1.5 px, 20 points": {"gcps": 20},
+    "1.5 px, 50 points": {"gcps": 50},
+    "1.5 px, 100 points": {"gcps": 100},
+    "1.5 px, 500 points": {"gcps": 500},
+    "1.5 px, 1000 points": {"gcps": 1000},
+    "1.5 px, 5000 points": {"gcps": 5000},
+    "0.8 px, 1000 points": {"distortion_px": 0.8},
+    "2.5 px, 1000 points": {"distortion_px": 2.5},
+    "20 % gross errors": {"gross_share": 0.2},
+    "no control in 40 % of the film": {"gap": 0.4},
+    "lens compensated, V/(H delta) = 0.014": {"lens": True},
+    "pair 1117": {"name": "1117"},
+}
+SIGMA_OF_START = np.concatenate([np.zeros(3), [50.0, 80.0, 30.0], np.radians([0.5] * 3 + [0.05] * 3), [0.001]])
+
+
+def observations(seed, *, gcps=1000, distortion_px=1.5, gap=0.0, lens=False, name="1112", **more):
+    """A simulated pair with all its points as control."""
+    cameras = pair(name)
+    if lens:
+        rows = [camera.parameters() * np.where(np.arange(13) == 9, 0.0, 1.0) for camera in cameras]
+        rows = [row + np.where(np.arange(13) == 12, 0.014 - row[12], 0.0) for row in rows]
+        cameras = tuple(camera.with_parameters(row) for camera, row in zip(cameras, rows, strict=True))
+    simulated = simulate_pair(
+        np.random.default_rng(seed), gcps=gcps, ties=6000, distortion_px=distortion_px, cameras=cameras, **more
+    )
+    control = []
+    for parts in zip(simulated.control, simulated.checks, strict=True):
+        joined = Control(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Control)))
+        kept = np.abs(joined.film_mm[:, 0]) >= gap * HALF_LENGTH_MM
+        control.append(Control(*(getattr(joined, f.name)[kept] for f in fields(Control))))
+    return replace(simulated, control=control)
+
+
+def y_parallax_px(simulated, cameras):
+    """Standard deviation of what is left across the epipolar planes at noise-free points."""
+    first, second, _ = conjugates(simulated.cameras, np.random.default_rng(97), 2000)
+    measured = [film + field(film) for film, field in zip((first, second), simulated.distortions, strict=True)]
+    ties = replace(simulated.ties, first_mm=measured[0], second_mm=measured[1], sigma_mm=np.full(len(first), PIXEL_MM))
+    return float(np.std(tie_rows(intersections(cameras, ties), ties).residuals) * np.sqrt(2.0))
+
+
+def compare(seed, case):
+    """Rows of the table: plain and field."""
+    simulated = observations(seed, **case)
+    rng = np.random.default_rng(seed + 100)
+    off = SIGMA_OF_START * rng.normal(size=(2, 13)) + np.concatenate([[4000.0, -3000.0, 1000.0], np.zeros(10)])
+    start = [camera.with_parameters(camera.parameters() + o) for camera, o in zip(simulated.cameras, off, strict=True)]
+    began = time.process_time()
+    block = orient_block(
+        start,
+        simulated.control,
+        [simulated.ties],
+        film_distortion_mm=0.010,
+        tie_distortion_mm=0.005,
+        gate_sigma=4.0,
+        field=FieldChoices(17.5, 14.0, (25.0, 40.0, 60.0, 100.0)),
+        reference=reference(simulated),
+    )
+    seconds = time.process_time() - began
+    for model, adjustment in (("plain", block.plain), ("field", block.adjustment)):
+        cameras = adjustment.cameras
+        residuals = [
+            ((points.film_mm - camera.project(points.ground_m)) / PIXEL_MM)[weights > 0]
+            for camera, points, weights in zip(cameras, simulated.control, adjustment.control_weights, strict=True)
+        ]
+        yield {
+            "model": model,
+            "errors_m": simulated.model_errors_m(cameras),
+            "y_parallax_px": y_parallax_px(simulated, cameras),
+            "residual_px": float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))),
+            "seconds": seconds,
+        }
+    prior = block.calibration.prior
+    print(f"<!-- {prior.length_mm:.0f} mm, {prior.amplitude_mm / PIXEL_MM:.2f} px -->", flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("cases", nargs="*", help=f"of {', '.join(CASES)}; all if left out")
+    parser.add_argument("--seed", type=int, default=1)
+    chosen = parser.parse_args()
+    print("| case | model | east m | north m | up m | y-parallax px | residual of control px | processor s |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in chosen.cases or CASES:
+        for row in compare(chosen.seed, CASES[name]):
+            errors = " | ".join(f"{error:.2f}" for error in row["errors_m"])
+            seconds = f"{row['seconds']:.0f}" if row["model"] == "field" else ""
+            numbers = f"{row['y_parallax_px']:.2f} | {row['residual_px']:.2f} | {seconds}"
+            print(f"| {name} | {row['model']} | {errors} | {numbers} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

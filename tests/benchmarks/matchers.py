@@ -1,0 +1,243 @@
+"""Matchers side by side: on a simulated site against its truth, and on two real images of one place.
+
+    python tests/benchmarks/matchers.py --make NEW_FOLDER [--pixel-um 56] [--matchers structural,sift,lightglue:xfeat]
+    python tests/benchmarks/matchers.py --folder SITE
+    COSP_TEST_DATA=... python tests/benchmarks/matchers.py --real
+
+--make simulates a site in a new folder and takes it as far as placed films; --folder takes one that has come so far,
+and only reads it. Each matcher runs in a process of its own, through the scripts of the rules match_tiles and
+collect_gcps, so that its time and memory are those of the workflow. The true residual of a point is where it was
+measured on the film, bent again as it was scanned, less where the simulator drew its ground point, without the smooth
+part that joining the film leaves in all of them.
+
+On the real images (Landsat 7, 20 July and 25 November 2002) a match is right within 3 px of where it should be; the
+two images themselves lie 0.9 px apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+HOME = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(HOME))
+
+from cosp import sheets  # noqa: E402
+from cosp.errors import CospError  # noqa: E402
+from cosp.film.bending import Bending  # noqa: E402
+from cosp.geometry.statistics import nmad  # noqa: E402
+from cosp.io import films, rasters, records, tables  # noqa: E402
+from cosp.matching.footprint import Footprint  # noqa: E402
+from cosp.matching.ground import ground_pixel_m, lattice_rc  # noqa: E402
+from cosp.matching.matchers import matcher_by_name  # noqa: E402
+from cosp.simulation.site import SiteSettings, plan_site  # noqa: E402
+from cosp.simulation.truth import true_film_coordinates  # noqa: E402
+from scripts.collect_gcps import collect_gcps  # noqa: E402
+from scripts.match_tiles import match_tiles  # noqa: E402
+
+MATCHERS = "structural,sift,lightglue:xfeat,lightglue:disk"
+RIGHT_PX = 3.0
+# Degree along and across the film of what joining leaves: scale, origin, turns of the parts.
+DEGREES = (5, 2)
+BANDS = (3, 4)
+
+
+def make_site(folder: Path, options: argparse.Namespace) -> None:
+    """A site of the simulator, taken as far as its placed films."""
+    command = [sys.executable, "-m", "cosp.simulation", "--directory", str(folder), "--name", "bench"]
+    command += ["--pixel-um", str(options.pixel_um), "--seed", str(options.seed)]
+    subprocess.run(command, check=True, cwd=HOME)
+    scenes = [line.split("\t")[0] for line in (folder / "scenes.tsv").read_text("utf-8").splitlines()[1:]]
+    wanted = [f"results/scenes/{scene}/footprint.json" for scene in scenes]
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(HOME / "Snakefile"), "--cores", "2", *wanted]
+    subprocess.run([*command, "--configfile", str(folder / "config.yaml"), "--directory", str(folder)], check=True)
+
+
+def settings_of(folder: Path) -> tuple[dict, str]:
+    """The config of a site with all defaults, and the site's name."""
+    written = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    known = sheets.schema("config")["properties"]
+    written = {key: value for key, value in written.items() if key in known}
+    return sheets.fill_defaults(sheets.schema("config"), written), next(iter(written["sites"]))
+
+
+def smooth_part(xy_mm: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Polynomial of the film coordinates that most values (N, 2) follow, at the same points."""
+    x, y = (xy_mm / np.abs(xy_mm).max(axis=0)).T
+    design = np.stack([x**i * y**j for i in range(DEGREES[0] + 1) for j in range(DEGREES[1] + 1)], axis=1)
+    weights = np.ones(len(x))
+    for _ in range(20):
+        fit = design @ np.linalg.lstsq(design * weights[:, None], values * weights[:, None], rcond=None)[0]
+        miss = np.linalg.norm(values - fit, axis=1)
+        weights = 1 / np.maximum(miss, 1.5 * np.median(miss))
+    return fit
+
+
+def measure(folder: Path, scene: str, name: str, target: Path) -> dict:
+    """One matcher on one film, with the scripts of the workflow; what came out, against the truth."""
+    settings, site = settings_of(folder)
+    matcher, _, features = name.partition(":")
+    chosen = {**settings["match_tiles"], "matcher": matcher}
+    if features:
+        chosen["features"] = features
+    sites = {key: settings["sites"][site][key] for key in ("reference_dem", "reference_image", "unstable_terrain")}
+    paths = {key: None if path is None else folder / path for key, path in sites.items()}
+    results = folder / "results" / "scenes" / scene
+    heights = {"reference_dem_heights": settings["sites"][site]["reference_dem_heights"]}
+    matches_path, gcps_path, summary_path = (target / n for n in ("matches.parquet", "gcps.parquet", "gcps.json"))
+    common = (results / "film.tif", results / "footprint.json", paths["reference_dem"])
+    began = time.process_time()
+    match_tiles(
+        *common, paths["reference_image"], matches_path, scatteritem="1-of-1", **heights, **chosen, threads=1
+    )  # fmt: skip
+    taken = time.process_time() - began
+    collect(matches_path, results, paths, gcps_path, summary_path, heights, settings["collect_gcps"])
+
+    matches = tables.read(matches_path)
+    posting_m = float(matches["posting_m"].iloc[0])
+    camera = records.read(results / "footprint.json", Footprint).camera
+    film_mm = abs(rasters.info(results / "film.tif").grid.step_x)
+    px_mm = film_mm * posting_m / ground_pixel_m(camera, film_mm, 1000.0)
+    gcps = tables.read(gcps_path)
+    kept = gcps[gcps["role"] != "rejected"]
+    truth = records.read_json(folder / f"resources/simulated/{site}/truth/site.json")
+    plan = plan_site(SiteSettings(**truth["settings"]))
+
+    film = records.read_json(results / "film.json")
+    bending = records.from_plain(film["bending"], Bending, "film.json")
+    # The bending is that of the film as it was delivered: an aft film was turned afterwards.
+    sign = np.array(films.signs(results / "footprint.json")) * (-1 if film["turned"] else 1)
+    xy = kept[["x_mm", "y_mm"]].to_numpy()
+    lonlath = kept[["longitude_deg", "latitude_deg", "height_m"]].to_numpy()
+    off = bending.bent(xy * sign) * sign - true_film_coordinates(plan, plan.scene(scene), lonlath)
+    error_mm = off - smooth_part(xy, off)
+    error_px = np.linalg.norm(error_mm, axis=1) / px_mm
+    claimed_mm = kept[["sigma_x_px", "sigma_y_px"]].to_numpy() * film_mm
+    summary = records.read_json(summary_path)
+    return {
+        "scene": scene,
+        "matcher": name,
+        "px": f"{posting_m:.0f} m",
+        "matches": len(matches),
+        "gcps": len(kept),
+        "median_px": float(np.median(error_px)),
+        "beyond_3_px": float((error_px > RIGHT_PX).mean()),
+        "error/sigma": nmad(error_mm / claimed_mm),
+        "cells": summary["coverage"]["cells"],
+        "seconds": taken,
+        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }
+
+
+def collect(matches_path, results, paths, gcps_path, summary_path, heights, chosen):
+    """The rule collect_gcps."""
+    collect_gcps(
+        [matches_path], results / "film.tif", results / "footprint.json", paths["reference_dem"],
+        paths["reference_image"], paths["unstable_terrain"], None, gcps_path, summary_path, **heights, **chosen,
+    )  # fmt: skip
+
+
+def real_images(names: list[str], data: Path) -> list[dict]:
+    """Matches of two real images of one place and grid, right and wrong, band by band."""
+    rows = []
+    chosen = sheets.fill_defaults(sheets.schema("config")["properties"]["match_tiles"], {})
+    keys = ("template_px", "search_px", "min_score", "max_ratio", "max_return_px", "max_features", "superglue_weights")
+    for band in BANDS:
+        july, november = (
+            rasters.read(data / "pennsylvania" / f"landsat7_2002{day}_b123457.tif", band).astype(np.float32)
+            for day in ("0720", "1125")
+        )
+        for name in names:
+            kind, _, features = name.partition(":")
+            try:
+                matcher = matcher_by_name(
+                    kind, features=features or chosen["features"], **{key: chosen[key] for key in keys}
+                )
+            except CospError as error:
+                print(f"skipped {name}: {error}")
+                continue
+            points = lattice_rc(july.shape, 8, chosen["template_px"] // 2 + chosen["search_px"])
+            began = time.process_time()
+            found = matcher.match(july, november, points, threads=1)
+            taken = time.process_time() - began
+            off = found.fixed_rc - found.moving_rc
+            right = np.linalg.norm(off, axis=1) <= RIGHT_PX
+            rows.append(
+                {
+                    "band": band,
+                    "matcher": name,
+                    "right": int(right.sum()),
+                    "wrong": int((~right).sum()),
+                    "shift_px": " ".join(f"{v:+.2f}" for v in np.median(off[right], axis=0)) if right.any() else "",
+                    "seconds": taken,
+                }
+            )
+    return rows
+
+
+def show(rows: list[dict]) -> None:
+    """Rows as a Markdown table."""
+    if not rows:
+        return
+    print("| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
+    for row in rows:
+        print("| " + " | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()) + " |")
+
+
+def main() -> int:
+    """Read the command line, measure, print tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, help="a site of the simulator with placed films; only read")
+    parser.add_argument("--make", type=Path, help="a new folder, to make such a site in")
+    parser.add_argument("--pixel-um", type=float, default=56.0)
+    parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--matchers", default=MATCHERS)
+    parser.add_argument("--scenes", type=int, default=1, help="films to match")
+    parser.add_argument("--real", action="store_true", help="the real images instead of a site")
+    parser.add_argument("--one", nargs=2, metavar=("SCENE", "MATCHER"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    names = options.matchers.split(",")
+    if options.real:
+        data = Path(os.environ.get("COSP_TEST_DATA", ""))
+        if not (data / "pennsylvania").is_dir():
+            print("skipped: COSP_TEST_DATA does not hold pennsylvania")
+            return 0
+        show(real_images(names, data))
+        return 0
+    if options.one:
+        with tempfile.TemporaryDirectory() as target:
+            print(json.dumps(measure(options.folder, *options.one, Path(target))))
+        return 0
+    if options.make:
+        if options.make.exists():
+            parser.error(f"{options.make} is there already; a site is made in a new folder only")
+        make_site(options.make, options)
+    folder = options.make or options.folder
+    scenes = sorted(path.parent.name for path in folder.glob("results/scenes/*/footprint.json")) if folder else []
+    if not scenes:
+        parser.error("no placed film; name a site by --folder, or a new folder by --make")
+    rows = []
+    for scene in scenes[: options.scenes]:
+        for name in names:
+            command = [sys.executable, str(Path(__file__)), "--folder", str(folder), "--one", scene, name]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode:
+                print(f"skipped {name}: {done.stderr.strip().splitlines()[-1]}")
+                continue
+            rows.append(json.loads(done.stdout.splitlines()[-1]))
+    show(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+"""Placement of films whose prediction is wrong in every respect: how many are placed, refused, placed wrongly.
+
+python tests/benchmarks/placement.py [trials] [first] [table.tsv]
+
+Whole films are exposed over made-up mountains of two epochs (other sun, snow line, fields and forests). Each trial
+hides a share of the film under clouds, lays it one of four ways round, and predicts it up to 100 km, 10 degrees and
+5 per cent wrong. The first posting is twice the default one, which is four times faster and leaves a quarter of the
+evidence; the last one is the first at which places are checked.
+With a table, trials are added to it and the table of all of them is printed.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.ndimage import gaussian_filter
+
+from cosp.geometry.grids import PixelGrid
+from cosp.imaging.windows import Window
+from cosp.matching.film_image import FilmImage
+from cosp.matching.ground import grown, map_bounds
+from cosp.matching.placement import locate_film, turned_about_centre
+from cosp.simulation.site import SiteSettings, plan_site
+from cosp.simulation.terrain import FILM_EPOCH, MODERN_EPOCH, light_terrain, make_terrain
+from tests.matching.conftest import CRS, World, make_camera, moved
+
+WORLD_POSTING_M = 120.0
+POSTING_M, LAST_POSTING_M = 480.0, 85.0
+PIXEL_MM = 0.3
+# A film placed within this of the truth everywhere, in millimetres of film, is placed right: five pixels of the last
+# level, well within what the next posting searches.
+RIGHT_MM = 1.5
+TRIALS_PER_WORLD = 20
+WAYS = {
+    (False, False): np.s_[:, :],
+    (True, False): np.s_[::-1, ::-1],
+    (False, True): np.s_[::-1],
+    (True, True): np.s_[:, ::-1],
+}
+
+
+def world_of(seed, camera):
+    """Ground, film and what the film hides nothing of."""
+    settings = SiteSettings(
+        seed=seed, centre_longitude_deg=9.0, centre_latitude_deg=46.0, snow_line_m=2600.0, modern_snow_line_m=3100.0
+    )
+    grid = PixelGrid.covering(grown(map_bounds(camera, CRS, (0.0, 3000.0)), 60e3), WORLD_POSTING_M)
+    plan = replace(plan_site(settings), crs=CRS, terrain_grid=grid)
+    terrain = make_terrain(plan, threads=1)
+    epochs = [light_terrain(plan, terrain, epoch, threads=1).radiance for epoch in (FILM_EPOCH, MODERN_EPOCH)]
+    pictures = [np.maximum(picture, 1).astype(np.float32) for picture in epochs]
+    world = World(grid, pictures[1], terrain.modern)
+    film = world.expose(camera, image=pictures[0], rng=np.random.default_rng([seed, 1]), pixel_mm=PIXEL_MM)
+    return world, film
+
+
+def clouded(pixels, share, rng):
+    """A film of which clouds leave only a share to be seen; clouds have a texture of their own."""
+    where = gaussian_filter(rng.standard_normal(pixels.shape), 20.0 / PIXEL_MM)
+    hidden = where > np.quantile(where, share)
+    billows = sum(s * gaussian_filter(rng.standard_normal(pixels.shape), s) for s in (1.0, 4.0, 16.0))
+    white = np.clip(215 + 15 * billows / billows.std(), 1, 255)
+    return np.where(hidden, white, pixels).astype(np.uint8)
+
+
+def trial(number, world, film, camera):
+    """One film placed, and how."""
+    rng = np.random.default_rng([77, number])
+    share = float(rng.choice([0.1, 0.2, 0.3, 0.5, 0.75, 1.0], p=[0.1, 0.1, 0.2, 0.2, 0.2, 0.2]))
+    way = list(WAYS)[int(rng.integers(4))]
+    shift_m, bearing = rng.uniform(0, 100e3), rng.uniform(0, 2 * np.pi)
+    turn_deg, scale = rng.uniform(-10, 10), rng.uniform(-0.05, 0.05)
+    if rng.random() < 0.5:  # corners that are merely moved, as most are
+        turn_deg, scale = turn_deg / 10, scale / 5
+    pixels = film.read(Window(0, film.grid.shape[0], 0, film.grid.shape[1]))
+    laid = FilmImage.from_array(np.ascontiguousarray(clouded(pixels, share, rng)[WAYS[way]]), film.grid)
+    predicted = turned_about_centre(camera, np.radians(turn_deg), 1 + scale, 1500.0)
+    predicted = moved(predicted, shift_m * np.cos(bearing), shift_m * np.sin(bearing))
+    start = time.process_time()
+    row = {"trial": number, "share": share, "turned": way[0], "mirrored": way[1], "shift_km": shift_m / 1e3,
+           "turn_deg": turn_deg, "scale": 100 * scale, "relief": number % 5 == 0}  # fmt: skip
+    located = locate_film(
+        laid, predicted, reference_on=None if row["relief"] else world.on(world.image),
+        heights_on=world.on(world.heights), day=None, crs=CRS, search_m=100e3, coarse_posting_m=POSTING_M,
+        fine_posting_m=LAST_POSTING_M, min_score=6.5, min_margin=2.0, min_agreeing=12, min_agreeing_share=0.3,
+        min_block_share=0.5, rng=np.random.default_rng(0), threads=1,
+    )  # fmt: skip
+    found = located.footprint
+    if found is None:
+        return {**row, "outcome": "refused", "cpu_s": time.process_time() - start, "why": located.refusal}
+    points = np.stack(np.meshgrid(np.linspace(-340, 340, 9), np.linspace(-26, 26, 3)), -1)
+    error_mm = np.linalg.norm(found.camera.project(camera.locate(points, 1500.0)) - points, axis=-1).max()
+    right = (found.turned, found.mirrored) == way and error_mm < RIGHT_MM
+    return {
+        **row, "outcome": "right" if right else "wrong", "cpu_s": time.process_time() - start, "error_mm": error_mm,
+        "score": found.score, "rival": found.rival_score, "margin": found.margin, "by": found.reference,
+    }  # fmt: skip
+
+
+def table_of(trials):
+    """Outcomes by the share of the film that shows ground."""
+    groups = []
+    for (relief, share), rows in trials.groupby(["relief", "share"]):
+        counts = rows["outcome"].value_counts()
+        placed = rows[rows["outcome"] == "right"]
+        groups.append(
+            {
+                "evidence": "relief alone" if relief else "image and relief",
+                "ground seen": f"{share:.0%}",
+                "trials": len(rows),
+                "placed": counts.get("right", 0),
+                "refused": counts.get("refused", 0),
+                "wrong": counts.get("wrong", 0),
+                "median error (mm of film)": f"{placed['error_mm'].median():.2f}",
+                "median score": f"{placed['score'].median():.1f}",
+                "median CPU (s)": f"{rows['cpu_s'].median():.0f}",
+            }  # fmt: skip
+        )
+    return pd.DataFrame(groups)
+
+
+def as_markdown(table):
+    lines = ["| " + " | ".join(table.columns) + " |", "|" + "---|" * len(table.columns)]
+    rows = [
+        "| " + " | ".join("–" if v == "nan" else str(v) for v in row) + " |" for row in table.itertuples(index=False)
+    ]
+    return "\n".join(lines + rows)
+
+
+def main(count=200, first=0, path=None):
+    """Run trials and print their table."""
+    camera = make_camera(half_length_mm=357.0)
+    rows, here = [], None
+    for number in range(first, first + count):
+        if here is None or number // TRIALS_PER_WORLD != here[0]:
+            here = (number // TRIALS_PER_WORLD, *world_of(100 + number // TRIALS_PER_WORLD, camera))
+        rows.append(trial(number, *here[1:], camera))
+        print({k: round(v, 2) if isinstance(v, float) else v for k, v in rows[-1].items()}, flush=True)
+        if path:
+            pd.DataFrame(rows[-1:]).reindex(columns=COLUMNS).to_csv(
+                path, sep="\t", mode="a", index=False, header=not Path(path).exists()
+            )
+    trials = pd.read_csv(path, sep="\t") if path else pd.DataFrame(rows).reindex(columns=COLUMNS)
+    print(as_markdown(table_of(trials)))
+
+
+COLUMNS = ["trial", "share", "turned", "mirrored", "shift_km", "turn_deg", "scale", "relief", "outcome", "cpu_s",
+           "error_mm", "score", "rival", "margin", "by", "why"]  # fmt: skip
+
+if __name__ == "__main__":
+    main(*(int(a) for a in sys.argv[1:3]), *sys.argv[3:4])
