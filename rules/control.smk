@@ -1,6 +1,6 @@
 rule locate_coarsely:
     input:
-        film="results/scenes/{scene}/film.tif",
+        film="results/scenes/{scene}/straight.tif",
         camera="results/scenes/{scene}/camera_predicted.json",
         reference_dem=of_site("reference_dem"),
         reference_image=site_file("reference_image"),
@@ -37,12 +37,15 @@ rule place_frame:
     input:
         placement="results/scenes/{scene}/placement.json",
         others=others_of_block("results/scenes/{scene}/placement.json"),
-        film="results/scenes/{scene}/film.tif",
+        film="results/scenes/{scene}/straight.tif",
+        film_summary="results/scenes/{scene}/straight.json",
         camera="results/scenes/{scene}/camera_predicted.json",
         reference_dem=of_site("reference_dem"),
         reference_image=site_file("reference_image"),
     output:
         footprint="results/scenes/{scene}/footprint.json",
+        film="results/scenes/{scene}/film.tif",
+        film_summary="results/scenes/{scene}/film.json",
     log:
         "logs/place_frame/{scene}.log",
     benchmark:
@@ -59,7 +62,7 @@ rule place_frame:
         day=of_scene("date"),
         reference_dem_heights=of_site("reference_dem_heights"),
     message:
-        "Settling where {wildcards.scene} lies"
+        "Settling where {wildcards.scene} lies, and which way round its film is"
     script:
         "../scripts/place_frame.py"
 

@@ -3,8 +3,6 @@ rule rectify:
         cameras=cameras_of_pair,
         fore_film=film_of("fore", "film.tif"),
         aft_film=film_of("aft", "film.tif"),
-        fore_footprint=film_of("fore", "footprint.json"),
-        aft_footprint=film_of("aft", "footprint.json"),
         reference_dem=of_site("reference_dem"),
         area_of_interest=site_file("area_of_interest"),
     output:
@@ -36,8 +34,6 @@ rule resample_epipolar:
     input:
         fore_film=film_of("fore", "film.tif"),
         aft_film=film_of("aft", "film.tif"),
-        fore_footprint=film_of("fore", "footprint.json"),
-        aft_footprint=film_of("aft", "footprint.json"),
         rectification="results/pairs/{pair}/rectification.json",
     output:
         fore="results/pairs/{pair}/fore_epipolar.tif",

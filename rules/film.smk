@@ -60,8 +60,8 @@ rule correct_bending:
         exposure="results/scenes/{scene}/exposure.json",
         stripes="results/scenes/{scene}/stripes.parquet",
     output:
-        film="results/scenes/{scene}/film.tif",
-        summary="results/scenes/{scene}/film.json",
+        film=temp("results/scenes/{scene}/straight.tif"),
+        summary="results/scenes/{scene}/straight.json",
         figure="results/scenes/{scene}/bending.png",
     log:
         "logs/correct_bending/{scene}.log",

@@ -1,6 +1,6 @@
 rule predict_camera:
     input:
-        film_summary="results/scenes/{scene}/film.json",
+        film_summary="results/scenes/{scene}/straight.json",
     output:
         camera="results/scenes/{scene}/camera_predicted.json",
     log:

@@ -117,7 +117,6 @@ rule grid_dem:
 rule orthorectify:
     input:
         film=lambda wildcards: f"results/scenes/{shown(wildcards)}/film.tif",
-        footprint=lambda wildcards: f"results/scenes/{shown(wildcards)}/footprint.json",
         cameras=cameras_of_pair,
         reference_dem=of_site("reference_dem"),
         dem="results/pairs/{pair}/dem.tif",

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from cosp.io import films, gcps, rasters, records, references, tables, vectors
+from cosp.io import gcps, rasters, records, references, tables, vectors
 from cosp.io.logs import log_to
 from cosp.matching.consistency import places_of, reference_shift
 from cosp.matching.control import collect
@@ -50,7 +50,7 @@ def collect_gcps(
 ):
     camera = records.read(footprint_path, Footprint).camera
     crs = map_crs(camera)
-    film = FilmImage(films.film_grid(film_path, footprint_path), lambda window: rasters.read(film_path, window=window))
+    film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
     heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
     dem_posting_m = references.posting_m(reference_dem_path)
     shift_m, shift = (0.0, 0.0), None
@@ -78,7 +78,6 @@ def collect_gcps(
     if own_gcps_path:
         own = gcps.read(own_gcps_path)
         own = own[own["scene"] == camera.scene].drop(columns="scene").reset_index(drop=True)
-        own[["x_mm", "y_mm"]] *= films.signs(footprint_path)  # measured on the raster
         log.info("%d points of %s are on this film", len(own), own_gcps_path)
     table, summary = collect(
         pd.concat([tables.read(path) for path in matches_paths], ignore_index=True),

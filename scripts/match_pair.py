@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from cosp.io import films, rasters, records, references, tables
+from cosp.io import rasters, records, references, tables
 from cosp.io.logs import log_to
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Footprint
@@ -41,11 +41,8 @@ def match_pair(
     crs = map_crs(fore_camera)
     heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
     fore, aft = (
-        FilmImage(films.film_grid(path, footprint_path), lambda window, path=path: rasters.read(path, window=window))
-        for path, footprint_path in (
-            (fore_film_path, fore_footprint_path),
-            (aft_film_path, aft_footprint_path),
-        )
+        FilmImage(rasters.info(path).grid, lambda window, path=path: rasters.read(path, window=window))
+        for path in (fore_film_path, aft_film_path)
     )
     ties = match_films(
         fore,

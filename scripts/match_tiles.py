@@ -3,7 +3,7 @@
 import pandas as pd
 
 from cosp.imaging.windows import strip_of
-from cosp.io import films, rasters, records, references, tables
+from cosp.io import rasters, records, references, tables
 from cosp.io.logs import log_to
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Footprint
@@ -45,7 +45,7 @@ def match_tiles(
     else:
         reference_on = relief_reference(heights_on, footprint.sun_azimuth_deg, footprint.sun_elevation_deg)
         reference_posting_m = references.posting_m(reference_dem_path)
-    film = FilmImage(films.film_grid(film_path, footprint_path), lambda window: rasters.read(film_path, window=window))
+    film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
     chosen = matcher_by_name(
         matcher,
         template_px=template_px,

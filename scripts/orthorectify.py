@@ -9,7 +9,7 @@ from cosp.camera.mapping import MapProjector
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window, tiles
-from cosp.io import films, rasters, records
+from cosp.io import rasters, records
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
 from cosp.surface.orthophoto import (
@@ -31,7 +31,6 @@ ROWS_AT_ONCE = 512
 
 def orthorectify(
     film_path,
-    footprint_path,
     camera_path,
     dem_path,
     reference_dem_path,
@@ -44,7 +43,7 @@ def orthorectify(
 ):
     log = logging.getLogger("orthorectify")
     camera = records.read(camera_path, PanoramicCamera)
-    film_grid = films.film_grid(film_path, footprint_path)
+    film_grid = rasters.info(film_path).grid
     dem = rasters.info(dem_path)
     grid, crs = dem.grid, dem.crs
     coarse = ellipsoidal_heights(reference_dem_path, grid.coarsened(COARSE), crs, reference_dem_heights)
@@ -112,7 +111,6 @@ if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         orthorectify(
             film_path=snakemake.input.film,
-            footprint_path=snakemake.input.footprint,
             camera_path=f"{snakemake.input.cameras}/{snakemake.params.scene}.json",
             dem_path=snakemake.input.dem,
             reference_dem_path=snakemake.input.reference_dem,

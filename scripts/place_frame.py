@@ -1,4 +1,4 @@
-"""Settle where a frame lies: as it was found by itself, or, where it was not, with the help of its neighbours."""
+"""Settle where a frame lies, as it was found by itself or with the help of its neighbours, and put its film right."""
 
 import logging
 from dataclasses import replace
@@ -8,7 +8,7 @@ import numpy as np
 
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import PlacementError
-from cosp.io import rasters, records, references
+from cosp.io import films, rasters, records, references
 from cosp.io.logs import log_to
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Attempt
@@ -21,11 +21,42 @@ from cosp.sheets import parse_scene_id
 def place_frame(
     placement_path,
     others_paths,
-    film_path,
+    straight_path,
+    straight_summary_path,
     camera_path,
     reference_dem_path,
     reference_image_path,
     footprint_path,
+    film_path,
+    film_summary_path,
+    **search,
+):
+    attempt = records.read(placement_path, Attempt)
+    footprint = attempt.footprint or placed_by_neighbours(
+        attempt, others_paths, straight_path, camera_path, reference_dem_path, reference_image_path, **search
+    )
+    films.put_right(straight_path, film_path, turned=footprint.turned, mirrored=footprint.mirrored)
+    records.write(film_summary_path, film_summary(records.read_json(straight_summary_path), footprint))
+    records.write(footprint_path, footprint)
+
+
+def film_summary(straight, footprint):
+    """What is said of the film: what its parts told, and how the ground saw it."""
+    said = dict(straight)
+    if footprint.turned or footprint.mirrored:
+        said["found_on_the_ground"] = {"turned": footprint.turned, "mirrored": footprint.mirrored}
+        said["turned"] = straight["turned"] != footprint.turned
+        said["mirrored"] = [mirrored != footprint.mirrored for mirrored in straight["mirrored"]]
+    return said
+
+
+def placed_by_neighbours(
+    attempt,
+    others_paths,
+    straight_path,
+    camera_path,
+    reference_dem_path,
+    reference_image_path,
     *,
     day,
     reference_dem_heights,
@@ -40,11 +71,8 @@ def place_frame(
     seed,
     threads,
 ):
+    """Footprint of a frame that was refused, found where its neighbours leave room for it, or from them alone."""
     log = logging.getLogger("place_frame")
-    attempt = records.read(placement_path, Attempt)
-    if attempt.footprint is not None:
-        records.write(footprint_path, attempt.footprint)
-        return
     camera = records.read(camera_path, PanoramicCamera)
     expected = neighbours_say(camera, [records.read(path, Attempt) for path in others_paths])
     if expected is None:
@@ -54,7 +82,7 @@ def place_frame(
     crs = map_crs(expected.camera)
     heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
     located = locate_film(
-        FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window)),
+        FilmImage(rasters.info(straight_path).grid, lambda window: rasters.read(straight_path, window=window)),
         expected.camera,
         reference_on=references.image_on(reference_image_path, crs) if reference_image_path else None,
         heights_on=heights_on,
@@ -74,11 +102,9 @@ def place_frame(
     height_m = Terrain.on(heights_on, grown(map_bounds(expected.camera, crs), window_m), crs, 1000.0).mean_m
     if located.footprint is None:
         log.warning("%s", located.refusal)
-        footprint = expected.footprint(camera, height_m)
-    else:
-        east, north = shift_m(camera, located.footprint.camera, height_m)
-        footprint = replace(located.footprint, shift_east_m=east, shift_north_m=north, neighbours=expected.neighbours)
-    records.write(footprint_path, footprint)
+        return expected.footprint(camera, height_m)
+    east, north = shift_m(camera, located.footprint.camera, height_m)
+    return replace(located.footprint, shift_east_m=east, shift_north_m=north, neighbours=expected.neighbours)
 
 
 def neighbours_say(camera, attempts):
@@ -97,11 +123,14 @@ if __name__ == "__main__":
         place_frame(
             placement_path=snakemake.input.placement,
             others_paths=list(snakemake.input.others),
-            film_path=snakemake.input.film,
+            straight_path=snakemake.input.film,
+            straight_summary_path=snakemake.input.film_summary,
             camera_path=snakemake.input.camera,
             reference_dem_path=snakemake.input.reference_dem,
             reference_image_path=snakemake.input.get("reference_image"),
             footprint_path=snakemake.output.footprint,
+            film_path=snakemake.output.film,
+            film_summary_path=snakemake.output.film_summary,
             day=snakemake.params.day,
             reference_dem_heights=snakemake.params.reference_dem_heights,
             search_km=snakemake.params.search_km,

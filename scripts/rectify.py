@@ -15,7 +15,6 @@ from cosp.epipolar.patches import film_patches
 from cosp.epipolar.polynomials import Basis
 from cosp.epipolar.rectification import fit_rectification
 from cosp.geometry.grids import PixelGrid
-from cosp.io import films as films_of
 from cosp.io import rasters, records, vectors
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
@@ -31,8 +30,6 @@ def rectify(
     aft_camera_path,
     fore_film_path,
     aft_film_path,
-    fore_footprint_path,
-    aft_footprint_path,
     reference_dem_path,
     area_of_interest_path,
     rectification_path,
@@ -56,10 +53,7 @@ def rectify(
         for camera in (fore, aft)
     )
     film_paths = (fore_film_path, aft_film_path)
-    film_grids = [
-        films_of.film_grid(path, footprint_path)
-        for path, footprint_path in zip(film_paths, (fore_footprint_path, aft_footprint_path), strict=True)
-    ]
+    film_grids = [rasters.info(path).grid for path in film_paths]
     pixel_mm = min(abs(grid.step_x) for grid in film_grids)
 
     if area_of_interest_path:
@@ -140,8 +134,6 @@ if __name__ == "__main__":
             aft_camera_path=f"{snakemake.input.cameras}/{snakemake.params.aft}.json",
             fore_film_path=snakemake.input.fore_film,
             aft_film_path=snakemake.input.aft_film,
-            fore_footprint_path=snakemake.input.fore_footprint,
-            aft_footprint_path=snakemake.input.aft_footprint,
             reference_dem_path=snakemake.input.reference_dem,
             area_of_interest_path=snakemake.input.area_of_interest,
             rectification_path=snakemake.output.rectification,

@@ -7,7 +7,7 @@ from functools import partial
 from cosp.epipolar.rectification import Rectification
 from cosp.epipolar.resampling import resample_window
 from cosp.imaging.windows import tiles
-from cosp.io import films, rasters, records
+from cosp.io import rasters, records
 from cosp.io.logs import log_to
 
 TILE = 1024
@@ -16,8 +16,6 @@ TILE = 1024
 def resample_epipolar(
     fore_film_path,
     aft_film_path,
-    fore_footprint_path,
-    aft_footprint_path,
     rectification_path,
     fore_path,
     aft_path,
@@ -26,8 +24,8 @@ def resample_epipolar(
     threads,
 ):
     rectification = records.read(rectification_path, Rectification)
-    fore_grid = films.film_grid(fore_film_path, fore_footprint_path)
-    aft_grid = films.film_grid(aft_film_path, aft_footprint_path)
+    fore_grid = rasters.info(fore_film_path).grid
+    aft_grid = rasters.info(aft_film_path).grid
     resample(fore_film_path, fore_grid, rectification.fore, rectification.grid, fore_path, interpolation, threads)
     resample(aft_film_path, aft_grid, rectification.aft, rectification.grid, aft_path, interpolation, threads)
 
@@ -62,8 +60,6 @@ if __name__ == "__main__":
         resample_epipolar(
             fore_film_path=snakemake.input.fore_film,
             aft_film_path=snakemake.input.aft_film,
-            fore_footprint_path=snakemake.input.fore_footprint,
-            aft_footprint_path=snakemake.input.aft_footprint,
             rectification_path=snakemake.input.rectification,
             fore_path=snakemake.output.fore,
             aft_path=snakemake.output.aft,

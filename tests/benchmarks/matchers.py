@@ -36,7 +36,7 @@ from cosp import sheets  # noqa: E402
 from cosp.errors import CospError  # noqa: E402
 from cosp.film.bending import Bending  # noqa: E402
 from cosp.geometry.statistics import nmad  # noqa: E402
-from cosp.io import films, rasters, records, tables  # noqa: E402
+from cosp.io import rasters, records, tables  # noqa: E402
 from cosp.matching.footprint import Footprint  # noqa: E402
 from cosp.matching.ground import ground_pixel_m, lattice_rc  # noqa: E402
 from cosp.matching.matchers import matcher_by_name  # noqa: E402
@@ -116,7 +116,8 @@ def measure(folder: Path, scene: str, name: str, target: Path) -> dict:
     film = records.read_json(results / "film.json")
     bending = records.from_plain(film["bending"], Bending, "film.json")
     # The bending is that of the film as it was delivered: an aft film was turned afterwards.
-    sign = np.array(films.signs(results / "footprint.json")) * (-1 if film["turned"] else 1)
+    through_its_back = records.read(results / "footprint.json", Footprint).mirrored
+    sign = np.array([1, -1 if through_its_back else 1]) * (-1 if film["turned"] else 1)
     xy = kept[["x_mm", "y_mm"]].to_numpy()
     lonlath = kept[["longitude_deg", "latitude_deg", "height_m"]].to_numpy()
     off = bending.bent(xy * sign) * sign - true_film_coordinates(plan, plan.scene(scene), lonlath)

@@ -49,7 +49,6 @@ def folder(tmp_path_factory):
     for look, camera, film in zip(("fore", "aft"), cameras, films, strict=True):
         records.write(folder / f"{look}.json", camera)
         rasters.write(folder / f"{look}.tif", film, grid=film_grid(camera), crs=rasters.FILM_CRS)
-        records.write(folder / f"{look}_footprint.json", {"kind": "footprint", "version": 1})
     lonlat = cameras[0].locate_geodetic(film_grid(cameras[0]).points([0, 0, 380, 380], [0, 480, 0, 480]), 1200.0)
     grid = PixelGrid.covering((*(lonlat[:, :2].min(0) - 0.1), *(lonlat[:, :2].max(0) + 0.1)), 0.01)
     level = np.full(grid.shape, 1200.0, np.float32)
@@ -61,7 +60,6 @@ def rectify(folder, name, **choices):
     function("rectify")(
         *(folder / f"{look}.json" for look in ("fore", "aft")),
         *(folder / f"{look}.tif" for look in ("fore", "aft")),
-        *(folder / f"{look}_footprint.json" for look in ("fore", "aft")),
         folder / "reference.tif",
         None,
         folder / name,
@@ -87,7 +85,6 @@ def test_what_the_films_show_across_the_rows_is_taken_out(folder):
     rectify(folder, "rectification.json")
     function("resample_epipolar")(
         *(folder / f"{look}.tif" for look in ("fore", "aft")),
-        *(folder / f"{look}_footprint.json" for look in ("fore", "aft")),
         folder / "rectification.json",
         folder / "fore_epipolar.tif",
         folder / "aft_epipolar.tif",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cosp.errors import PlacementError
+from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.io import rasters, records
 from cosp.matching.footprint import Attempt, Footprint
@@ -36,13 +37,15 @@ def settle(folder, world, film, predicted, others):
     rasters.write(folder / "image.tif", world.image.astype(np.uint8), grid=world.grid, crs=CRS)
     pixels = film.read(Window(0, film.grid.shape[0], 0, film.grid.shape[1]))
     rasters.write(folder / "film.tif", pixels, grid=film.grid, crs=rasters.FILM_CRS)
+    records.write(folder / "straight.json", {"turned": False, "mirrored": [False] * 4})
     records.write(folder / "camera.json", predicted)
     records.write(folder / "own.json", Attempt(predicted.scene, None, f"{predicted.scene}: cannot be placed: no peak"))
     for number, other in enumerate(others):
         records.write(folder / f"other{number}.json", other)
     place_frame(
         folder / "own.json", [folder / f"other{number}.json" for number in range(len(others))], folder / "film.tif",
-        folder / "camera.json", folder / "dem.tif", folder / "image.tif", folder / "footprint.json", **LIMITS,
+        folder / "straight.json", folder / "camera.json", folder / "dem.tif", folder / "image.tif",
+        folder / "footprint.json", folder / "right.tif", folder / "film.json", **LIMITS,
     )  # fmt: skip
     return records.read(folder / "footprint.json", Footprint)
 
@@ -70,6 +73,27 @@ def test_a_blank_frame_keeps_what_its_neighbours_say_and_how_little_that_is(tmp_
     assert 5000.0 < found.sigma_m < 12000.0
     assert abs(found.shift_east_m + 60000.0) < found.sigma_m
     assert abs(found.shift_north_m - 50000.0) < 2 * found.sigma_m
+
+
+@pytest.mark.parametrize("aft", [False, True])
+def test_a_film_seen_through_its_back_is_put_right_and_its_summary_says_so(tmp_path, camera, aft):
+    grey = np.arange(1, 121, dtype=np.uint8).reshape(6, 20)
+    rasters.write(
+        tmp_path / "straight.tif", grey, grid=PixelGrid(-9.5, 2.5, 1.0, -1.0, grey.shape), crs=rasters.FILM_CRS
+    )
+    records.write(tmp_path / "straight.json", {"turned": aft, "mirrored": [False, True, False, False]})
+    found = replace(footprint_of(camera), turned=True, mirrored=True)
+    records.write(tmp_path / "own.json", Attempt(camera.scene, found, None))
+    right, said = tmp_path / "film.tif", tmp_path / "film.json"
+    place_frame(
+        tmp_path / "own.json", [], tmp_path / "straight.tif", tmp_path / "straight.json", tmp_path / "camera.json",
+        tmp_path / "dem.tif", None, tmp_path / "footprint.json", right, said, **LIMITS,
+    )  # fmt: skip
+    np.testing.assert_array_equal(rasters.read(right), grey[:, ::-1])
+    summary = records.read_json(said)
+    assert summary["turned"] is not aft
+    assert summary["mirrored"] == [True, False, True, True]
+    assert summary["found_on_the_ground"] == {"turned": True, "mirrored": True}
 
 
 def test_a_frame_without_neighbours_is_refused_with_its_own_evidence(tmp_path, world, camera):

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.io import rasters, records, tables
+from cosp.io.films import put_right
 from cosp.matching.footprint import Footprint
 from cosp.matching.ground import grown, map_bounds
 from cosp.matching.placement import locate_film
@@ -40,7 +41,8 @@ def test_control_from_relief_lies_within_half_a_posting_and_says_so_though_the_f
     noisy = world.heights + 3.0 * rng.standard_normal(world.heights.shape).astype(np.float32)
     rasters.write(tmp_path / "dem.tif", noisy, grid=world.grid, crs=CRS)
     through_its_back = np.ascontiguousarray(film.read(_whole(film.grid))[::-1])
-    rasters.write(tmp_path / "film.tif", through_its_back, grid=film.grid, crs=rasters.FILM_CRS)
+    rasters.write(tmp_path / "straight.tif", through_its_back, grid=film.grid, crs=rasters.FILM_CRS)
+    put_right(tmp_path / "straight.tif", tmp_path / "film.tif", turned=False, mirrored=True)
     footprint = Footprint(
         scene=camera.scene, camera=camera, shift_east_m=0.0, shift_north_m=0.0, turned=False, score=20.0, margin=9.0,
         agreeing_share=1.0, residual_m=10.0, posting_m=POSTING, reference="relief", sun_azimuth_deg=135.0,

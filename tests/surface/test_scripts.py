@@ -78,7 +78,6 @@ def site(tmp_path_factory):
     records.write(folder / "y_parallax.json", {"kind": "y_parallax", "version": 1, "median_px": 0.01, "sd_px": 0.2})
     records.write(folder / "adjustment.json", {"kind": "adjustment", "version": 1, "sigma_naught_px": 1.1})
 
-    records.write(folder / "fore_footprint.json", {"kind": "footprint", "version": 1})
     film_grid = PixelGrid(-28.0 + PIXEL_MM / 2, 27.0 - PIXEL_MM / 2, PIXEL_MM, -PIXEL_MM, (386, 400))
     for look, c in cameras.items():
         seen = to_map.map_from_geodetic(
@@ -124,7 +123,6 @@ def site(tmp_path_factory):
     )
     function("orthorectify")(
         folder / "fore.tif",
-        folder / "fore_footprint.json",
         folder / f"{fore.scene}.json",
         folder / "dem.tif",
         folder / "truth.tif",
