@@ -107,7 +107,10 @@ rule mosaic_site:
         cameras=of_blocks_of_site("results/blocks/{block}/cameras"),
         area_of_interest=site_file("area_of_interest"),
         residual_figures=of_blocks_of_site("results/blocks/{block}/residuals.png"),
+        field_figures=of_blocks_of_site("results/blocks/{block}/film_fields.png"),
         placement_figures=of_scenes_of_site("results/scenes/{scene}/placement.png"),
+        seam_figures=of_scenes_of_site("results/scenes/{scene}/seams.png"),
+        bending_figures=of_scenes_of_site("results/scenes/{scene}/bending.png"),
         reference_dem=of_site("reference_dem"),
         unstable_terrain=site_file("unstable_terrain"),
     output:

@@ -45,7 +45,10 @@ def mosaic_site(
     seam_paths,
     adjustment_paths,
     residual_figure_paths,
+    field_figure_paths,
     placement_figure_paths,
+    seam_figure_paths,
+    bending_figure_paths,
     camera_folders,
     reference_dem_path,
     unstable_path,
@@ -192,6 +195,10 @@ def mosaic_site(
             pictures=tuple(
                 Picture(Path(path).read_bytes(), f"{block}: residuals of the adjustment")
                 for block, path in zip(blocks, residual_figure_paths, strict=True)
+            )
+            + tuple(
+                Picture(Path(path).read_bytes(), f"{block}: distortion of the films that the adjustment found")
+                for block, path in zip(blocks, field_figure_paths, strict=True)
             ),
             tables=(comparison("Adjustment of each block", adjustments),),
         ),
@@ -208,7 +215,17 @@ def mosaic_site(
         ),
         Section(
             "Films",
-            pictures=(picture(draw_bending([bending(*film) for film in films.items()]), "bending that was taken out"),),
+            pictures=(
+                picture(draw_bending([bending(*film) for film in films.items()]), "bending that was taken out"),
+                *(
+                    Picture(Path(path).read_bytes(), f"{scene}: {caption}")
+                    for caption, paths in (
+                        ("what the overlaps of its parts show", seam_figure_paths),
+                        ("how straight it is, and its rail holes", bending_figure_paths),
+                    )
+                    for scene, path in zip(scenes, paths, strict=True)
+                ),
+            ),
             tables=(seam_table(named(scenes, seam_paths)),),
             details=(comparison("Everything in film.json", films),),
         ),
@@ -331,7 +348,10 @@ if __name__ == "__main__":
             seam_paths=list(snakemake.input.seams),
             adjustment_paths=list(snakemake.input.adjustments),
             residual_figure_paths=list(snakemake.input.residual_figures),
+            field_figure_paths=list(snakemake.input.field_figures),
             placement_figure_paths=list(snakemake.input.placement_figures),
+            seam_figure_paths=list(snakemake.input.seam_figures),
+            bending_figure_paths=list(snakemake.input.bending_figures),
             camera_folders=list(snakemake.input.cameras),
             area_path=snakemake.input.area_of_interest or None,
             reference_dem_path=snakemake.input.reference_dem,
