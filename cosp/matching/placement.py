@@ -283,7 +283,7 @@ def locate_film(
             else:
                 return Located(footprint, None, found.maps)
     except NoOverlapError as nothing:
-        refusal = str(nothing)
+        refusal = f"{predicted.scene}: cannot be placed: {nothing}"
     log.warning("%s", refusal)
     return Located(None, refusal, found.maps)
 

@@ -111,7 +111,7 @@ def test_noise_is_refused(camera, world):
 
 
 def test_a_film_far_outside_the_reference_is_refused(film, camera, world):
-    with pytest.raises(PlacementError, match="holds no"):
+    with pytest.raises(PlacementError, match=f"{camera.scene}: cannot be placed: the reference DEM holds no height"):
         locate(film, moved(camera, 0.0, 400000.0), world)
 
 
