@@ -7,7 +7,7 @@ from cosp.io import rasters, records, references, tables
 from cosp.io.logs import log_to
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Footprint
-from cosp.matching.ground import control_tiles, map_crs, match_strip
+from cosp.matching.ground import PlacedFilm, control_tiles, map_crs, match_control
 from cosp.matching.matchers import LEARNED, matcher_by_name
 from cosp.matching.relief import relief_reference, relief_sigma_m
 from cosp.matching.wide_tiles import match_wide_strip
@@ -57,36 +57,28 @@ def match_tiles(
         max_features=max_features,
         superglue_weights=superglue_weights,
     )
+    placed = PlacedFilm.of(
+        film,
+        camera,
+        reference_on=reference_on,
+        heights_on=heights_on,
+        crs=crs,
+        reference_posting_m=reference_posting_m,
+    )
     if matcher in LEARNED:
-        matches, posting_m, pixel_m = match_wide_strip(
-            film,
-            camera,
-            scatteritem,
-            reference_on=reference_on,
-            heights_on=heights_on,
-            crs=crs,
-            matcher=chosen,
-            reference_posting_m=reference_posting_m,
-            tile_px=tile_px,
-            threads=threads,
-        )
+        matches = match_wide_strip(placed, scatteritem, matcher=chosen, tile_px=tile_px, threads=threads)
     else:
         tiles_mm = control_tiles(camera, candidates)
         first, last = strip_of(len(tiles_mm), scatteritem)
-        matches, posting_m, pixel_m = match_strip(
-            film,
-            camera,
+        matches = match_control(
+            placed,
             tiles_mm[first:last],
-            reference_on=reference_on,
-            heights_on=heights_on,
-            crs=crs,
             matcher=chosen,
-            reference_posting_m=reference_posting_m,
             template_px=template_px,
             search_px=search_px,
             threads=threads,
         )
-    sigma_m = matches.sigma_m if reference_image_path else relief_sigma_m(matches.sigma_m, posting_m)
+    sigma_m = matches.sigma_m if reference_image_path else relief_sigma_m(matches.sigma_m, placed.posting_m)
     lonlath = matches.lonlath(crs)
     table = {
         "x_mm": matches.film_mm[:, 0],
@@ -94,8 +86,8 @@ def match_tiles(
         "longitude_deg": lonlath[:, 0],
         "latitude_deg": lonlath[:, 1],
         "score": matches.score,
-        "sigma_px": sigma_m / pixel_m,
-        "posting_m": posting_m,
+        "sigma_px": sigma_m / placed.pixel_m,
+        "posting_m": placed.posting_m,
     }
     tables.write(matches_path, pd.DataFrame(table))
 

@@ -335,59 +335,95 @@ def control_tiles(camera: PanoramicCamera, candidates: int) -> FloatArray:
     return film_lattice(camera.half_length_mm, camera.half_width_mm, max(1, round(count / rows)), rows)
 
 
-def match_strip(
-    film: FilmImage,
-    camera: PanoramicCamera,
-    tiles_mm: FloatArray,
-    *,
-    reference_on: OnGrid,
-    heights_on: OnGrid,
-    crs: str,
-    matcher: Matcher,
-    reference_posting_m: float,
-    template_px: int,
-    search_px: int,
-    threads: int,
-) -> tuple[GroundMatches, float, float]:
-    """Matches of a strip of a placed film, at the coarser of film and reference.
+@dataclass(frozen=True)
+class PlacedFilm:
+    """A placed film and the ground it shows, to be matched at the coarser of film and reference.
 
     Parameters
     ----------
     film : FilmImage
-        At full resolution; only the strip is read.
+        At full resolution; only what is matched is read.
     camera : PanoramicCamera
         Good to a few pixels.
-    tiles_mm : (N, 2) array
-        Film points about which tiles are matched.
-    reference_posting_m : float
-        What the reference can show.
-
-    Returns
-    -------
-    matches : GroundMatches
+    reference_on, heights_on : functions of a PixelGrid
+    terrain : Terrain
+        Of the whole film.
     posting_m, pixel_m : float
-        What was matched at, and the side of a film pixel on the ground.
+        What is matched at, and the side of a film pixel on the ground.
     """
-    terrain = Terrain.on(heights_on, grown(map_bounds(camera, crs), 2000.0), crs, _TERRAIN_POSTING_M)
-    pixel_m = ground_pixel_m(camera, film.pixel_mm, terrain.mean_m)
-    posting_m = max(reference_posting_m, pixel_m)
+
+    film: FilmImage
+    camera: PanoramicCamera
+    reference_on: OnGrid
+    heights_on: OnGrid
+    terrain: Terrain
+    posting_m: float
+    pixel_m: float
+
+    @classmethod
+    def of(
+        cls,
+        film: FilmImage,
+        camera: PanoramicCamera,
+        *,
+        reference_on: OnGrid,
+        heights_on: OnGrid,
+        crs: str,
+        reference_posting_m: float,
+    ) -> PlacedFilm:
+        """A film on its ground, `reference_posting_m` being what the reference can show."""
+        terrain = Terrain.on(heights_on, grown(map_bounds(camera, crs), 2000.0), crs, _TERRAIN_POSTING_M)
+        pixel_m = ground_pixel_m(camera, film.pixel_mm, terrain.mean_m)
+        posting_m = max(reference_posting_m, pixel_m)
+        return cls(film, camera, reference_on, heights_on, terrain, posting_m, pixel_m)
+
+    def on_film_mm(self, count_px: float) -> float:
+        """Length on the film of so many pixels of what is matched."""
+        return count_px * self.posting_m / self.pixel_m * self.film.pixel_mm
+
+    def match(
+        self,
+        tiles_mm: FloatArray,
+        *,
+        matcher: Matcher,
+        tile_px: int,
+        step_px: int,
+        margin_px: int,
+        threads: int,
+    ) -> GroundMatches:
+        """Matches of tiles about film points, as `match_film_to_ground` gives them; none for no tile."""
+        if not len(tiles_mm):
+            return GroundMatches.joined([])
+        reach_mm = self.on_film_mm(tile_px)  # half a tile and the slant of a map square on the film
+        part = self.film.part(float(tiles_mm[:, 0].min()) - reach_mm, float(tiles_mm[:, 0].max()) + reach_mm)
+        matches = match_film_to_ground(
+            part.reduced(reduction_for(self.posting_m, self.pixel_m)),
+            self.camera,
+            tiles_mm,
+            reference_on=self.reference_on,
+            heights_on=self.heights_on,
+            terrain=self.terrain,
+            matcher=matcher,
+            posting_m=self.posting_m,
+            tile_px=tile_px,
+            step_px=step_px,
+            margin_px=margin_px,
+            threads=threads,
+        )
+        log.info("%d matches in %d tiles of %d px at %.1f m", len(matches), len(tiles_mm), tile_px, self.posting_m)
+        return matches
+
+
+def match_control(
+    placed: PlacedFilm, tiles_mm: FloatArray, *, matcher: Matcher, template_px: int, search_px: int, threads: int
+) -> GroundMatches:
+    """Matches of templates in small tiles about film points, such as those of `control_tiles`."""
     step_px = max(template_px // 2, 1)
-    tile_px = template_px + 2 * search_px + (_TILE_SIDE - 1) * step_px + 6
-    reach_mm = tile_px * posting_m / pixel_m * film.pixel_mm
-    part = film.part(float(tiles_mm[:, 0].min()) - reach_mm, float(tiles_mm[:, 0].max()) + reach_mm)
-    matches = match_film_to_ground(
-        part.reduced(reduction_for(posting_m, pixel_m)),
-        camera,
+    return placed.match(
         tiles_mm,
-        reference_on=reference_on,
-        heights_on=heights_on,
-        terrain=terrain,
         matcher=matcher,
-        posting_m=posting_m,
-        tile_px=tile_px,
+        tile_px=template_px + 2 * search_px + (_TILE_SIDE - 1) * step_px + 6,
         step_px=step_px,
         margin_px=template_px // 2 + search_px,
         threads=threads,
     )
-    log.info("%d matches about %d film points at %.1f m", len(matches), len(tiles_mm), posting_m)
-    return matches, posting_m, pixel_m

@@ -8,6 +8,7 @@ from cosp.geometry.grids import PixelGrid
 from cosp.geometry.rays import meet
 from cosp.matching.film_image import FilmImage
 from cosp.matching.ground import (
+    PlacedFilm,
     Terrain,
     control_tiles,
     film_coordinates,
@@ -16,7 +17,7 @@ from cosp.matching.ground import (
     grown,
     lattice_rc,
     map_bounds,
-    match_strip,
+    match_control,
     reduction_for,
     tile_about,
 )
@@ -104,12 +105,12 @@ def test_control_matches_lie_where_the_true_camera_shows_them(world, camera):
     film = world.expose(camera, rng=np.random.default_rng(1))
     reference = world.on(255 - world.image)
     matcher = structural(49, 8, 0.3, 0.9, 1.0)
-    matches, posting_m, pixel_m = match_strip(
-        film, camera, control_tiles(camera, 300),
-        reference_on=reference, heights_on=world.on(world.heights), crs=CRS, matcher=matcher,
-        reference_posting_m=60.0, template_px=49, search_px=8, threads=1,
-    )  # fmt: skip
-    assert posting_m == pytest.approx(max(60.0, pixel_m))
+    placed = PlacedFilm.of(
+        film, camera, reference_on=reference, heights_on=world.on(world.heights), crs=CRS, reference_posting_m=60.0
+    )
+    tiles_mm = control_tiles(camera, 300)
+    matches = match_control(placed, tiles_mm, matcher=matcher, template_px=49, search_px=8, threads=1)
+    assert placed.posting_m == pytest.approx(max(60.0, placed.pixel_m))
     error = np.linalg.norm(camera.project_geodetic(matches.lonlath(CRS)) - matches.film_mm, axis=1) / film.pixel_mm
     assert len(matches) > 150
     assert np.median(error) < 0.2

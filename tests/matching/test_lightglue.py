@@ -9,7 +9,7 @@ from scipy.ndimage import shift as shift_image
 
 from cosp.errors import InputError
 from cosp.imaging.windows import strips
-from cosp.matching.ground import GroundMatches
+from cosp.matching.ground import GroundMatches, PlacedFilm
 from cosp.matching.lightglue import LearnedMatcher, lightglue, superglue
 from cosp.matching.matchers import matcher_by_name, structural
 from cosp.matching.wide_tiles import match_wide_strip, wide_tiles
@@ -74,6 +74,14 @@ def test_wide_tiles_cover_the_film_in_order():
 @pytest.mark.slow
 def test_strips_of_wide_tiles_give_what_the_whole_gives_and_lie_where_the_camera_shows_them(world, camera):
     film = world.expose(camera, rng=np.random.default_rng(1))
+    placed = PlacedFilm.of(
+        film,
+        camera,
+        reference_on=world.on(world.image),
+        heights_on=world.on(world.heights),
+        crs=CRS,
+        reference_posting_m=90.0,
+    )
     calls = []
 
     def pair(moving, fixed):
@@ -82,19 +90,16 @@ def test_strips_of_wide_tiles_give_what_the_whole_gives_and_lie_where_the_camera
         return points, points, np.ones(len(points))
 
     def strip(name):
-        return match_wide_strip(
-            film, camera, name, reference_on=world.on(world.image), heights_on=world.on(world.heights), crs=CRS,
-            matcher=learned(pair, 4), reference_posting_m=90.0, tile_px=256, threads=1,
-        )  # fmt: skip
+        return match_wide_strip(placed, name, matcher=learned(pair, 4), tile_px=256, threads=1)
 
-    whole, posting_m, _ = strip("1-of-1")
+    whole = strip("1-of-1")
     count = len(calls)
-    assert posting_m == 90.0
+    assert placed.posting_m == 90.0
     error = np.linalg.norm(camera.project_geodetic(whole.lonlath(CRS)) - whole.film_mm, axis=1) / film.pixel_mm
     assert len(whole) > 200
     assert np.median(error) < 0.2
     assert np.ptp(whole.film_mm[:, 0]) > 1.7 * camera.half_length_mm
-    parts = [strip(f"{i + 1}-of-{count + 2}")[0] for i in range(len(strips(count, count + 2)))]
+    parts = [strip(f"{i + 1}-of-{count + 2}") for i in range(len(strips(count, count + 2)))]
     np.testing.assert_array_equal(GroundMatches.joined(parts).film_mm, whole.film_mm)
 
 
