@@ -35,15 +35,18 @@ def _unit(column: int, row: int, seed: int) -> float:
     return _hash(column, row, seed) * (2.0 / 4294967296.0) - 1.0
 
 
+@njit(nogil=True, cache=True, inline="always")
+def _lattice_cell(x: float, y: float) -> tuple[int, int, float, float]:
+    """Column and row of the lattice cell that a place lies in, and how far it lies in the cell (0 to 1)."""
+    column = math.floor(x)
+    row = math.floor(y)
+    return column, row, x - column, y - row
+
+
 @njit(nogil=True, cache=True)
 def value_noise(x: float, y: float, seed: int) -> float:
     """Smooth noise in [-1, 1] with lattice spacing 1; the same number at the same place, always."""
-    floor_x = math.floor(x)
-    floor_y = math.floor(y)
-    column = int(floor_x)
-    row = int(floor_y)
-    u = x - floor_x
-    v = y - floor_y
+    column, row, u, v = _lattice_cell(x, y)
     u = u * u * (3.0 - 2.0 * u)
     v = v * v * (3.0 - 2.0 * v)
     top = _unit(column, row, seed) * (1.0 - u) + _unit(column + 1, row, seed) * u
@@ -61,12 +64,7 @@ def _gradient_dot(column: int, row: int, seed: int, dx: float, dy: float) -> flo
 @njit(nogil=True, cache=True)
 def gradient_noise(x: float, y: float, seed: int) -> float:
     """Gradient noise with lattice spacing 1, about -1 to 1, without the lattice pattern of value noise."""
-    floor_x = math.floor(x)
-    floor_y = math.floor(y)
-    column = int(floor_x)
-    row = int(floor_y)
-    u = x - floor_x
-    v = y - floor_y
+    column, row, u, v = _lattice_cell(x, y)
     fade_u = u * u * u * (u * (u * 6.0 - 15.0) + 10.0)
     fade_v = v * v * v * (v * (v * 6.0 - 15.0) + 10.0)
     a = _gradient_dot(column, row, seed, u, v)
