@@ -88,6 +88,7 @@ def match_tiles(
         "score": matches.score,
         "sigma_px": sigma_m / placed.pixel_m,
         "posting_m": placed.posting_m,
+        "template_px": template_px,
     }
     tables.write(matches_path, pd.DataFrame(table))
 

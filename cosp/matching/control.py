@@ -19,6 +19,7 @@ from cosp.matching.film_image import FilmImage
 from cosp.matching.filtering import block_of, consistent_by_tile, in_check_blocks, thinned
 from cosp.matching.ground import Bounds, OnGrid, ground_pixel_m, grown
 from cosp.matching.masks import at_points, film_faults, gradient, still_water
+from cosp.matching.redundancy import sigma_factor
 from cosp.matching.refit import refit_camera
 
 log = logging.getLogger(__name__)
@@ -74,13 +75,14 @@ def collect(
 
     Points on voids, steep slopes, still water, unstable terrain, overexposed film and scratches are left out; those
     that disagree with their neighbours or with a robust resection of the film are kept as rejected; the rest is thinned
-    to an even spread and every other block of the film is held back as check points. Points of the user's own are all
-    control, whatever they say.
+    to an even spread and every other block of the film is held back as check points. The standard deviations that the
+    matcher states are scaled by what neighbours say. Points of the user's own are all control, whatever they say.
 
     Parameters
     ----------
     matches : table
-        Columns x_mm, y_mm, longitude_deg, latitude_deg, score, sigma_px, posting_m.
+        Columns x_mm, y_mm, longitude_deg, latitude_deg, score, sigma_px, posting_m, template_px (of the images that
+        were matched).
     film : FilmImage
     camera : PanoramicCamera
         Of the placed film.
@@ -199,13 +201,25 @@ def collect(
     dem_sigma = np.where(np.isfinite(given), given, dem_sigma_m)
     rise[known_height] = 0.0  # measured with the point, not read from the DEM at its place
     sigma_height = np.hypot(dem_sigma, np.hypot(*rise.T) * sigma_ground)
-    covariance = film_covariance(camera, ground, sigma_px * film.pixel_mm, sigma_ground, dem_sigma, rise)
-    total = covariance + _FILM_SIGMA_MM**2 * np.eye(2)
     control = kept & ~check
     require(int(control.sum()), needed // 2, scene, "ground control points outside the check blocks")
-    spread_mm = np.sqrt(np.trace(total, axis1=1, axis2=2) / 2)
+
+    def covariances() -> tuple[FloatArray, FloatArray]:
+        """Of the points alone, and with what the film adds."""
+        of_points = film_covariance(camera, ground, sigma_px * film.pixel_mm, sigma_ground, dem_sigma, rise)
+        return of_points, of_points + _FILM_SIGMA_MM**2 * np.eye(2)
+
+    spread_mm = np.sqrt(np.trace(covariances()[1], axis1=1, axis2=2) / 2)
     fitted = refit_camera(camera, film_mm[control], ground[control], spread_mm[control]).camera
     residual = film_mm - fitted.project(ground)
+    # What a matcher states of itself is a guess that errs on the safe side; the matches tell.
+    factor = None
+    if agreeing.any():
+        template_mm = float((points["template_px"] * points["posting_m"]).median()) * film.pixel_mm / pixel_m
+        factor = sigma_factor(film_mm[agreeing], residual[agreeing], sigma_px[agreeing] * film.pixel_mm, template_mm)
+    if factor is not None:
+        sigma_px = np.where(mine, sigma_px, factor * sigma_px)
+    covariance, total = covariances()
     standardised = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(total), residual))
     gross = ~(standardised <= _GATE_SIGMA)
     rejected = ~mine & ((kept & gross) | (usable & ~agreeing))
@@ -248,6 +262,7 @@ def collect(
         "rejected": int(rejected.sum()),
         "own": int((kept & mine).sum()),
         "own_disagreeing": int((kept & mine & gross).sum()),
+        "sigma_factor": factor,
         "median_sigma_px": float(np.median(sigma_px[kept])),
         "coverage": covered,
         "residual_px": {
@@ -269,7 +284,7 @@ def _joined(matches: pd.DataFrame, own: pd.DataFrame | None, reference_sigma_m: 
     parts = [matches.assign(height_m=np.nan, sigma_ground_m=reference_sigma_m, sigma_height_m=np.nan, source="match")]
     if own is not None and len(own):
         ground = own["sigma_ground_m"].fillna(reference_sigma_m)
-        parts.append(own.assign(source="own", score=1.0, posting_m=np.nan, sigma_ground_m=ground))
+        parts.append(own.assign(source="own", score=1.0, posting_m=np.nan, template_px=np.nan, sigma_ground_m=ground))
     return pd.concat([part for part in parts if len(part)], ignore_index=True)
 
 

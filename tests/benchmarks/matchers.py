@@ -7,8 +7,8 @@
 --make simulates a site in a new folder and takes it as far as placed films; --folder takes one that has come so far,
 and only reads it. Each matcher runs in a process of its own, through the scripts of the rules match_tiles and
 collect_gcps, so that its time and memory are those of the workflow. The true residual of a point is where it was
-measured on the film, bent again as it was scanned, less where the simulator drew its ground point, without the smooth
-part that joining the film leaves in all of them.
+measured on the film, taken back to the digitised part it came from, less where the simulator drew its ground point in
+that part.
 
 On the real images (Landsat 7, 20 July and 25 November 2002) a match is right within 3 px of where it should be; the
 two images themselves lie 0.9 px apart.
@@ -35,20 +35,20 @@ sys.path.insert(0, str(HOME))
 from cosp import sheets  # noqa: E402
 from cosp.errors import CospError  # noqa: E402
 from cosp.film.bending import Bending  # noqa: E402
+from cosp.film.exposure import Exposure  # noqa: E402
+from cosp.film.joining import Layout  # noqa: E402
 from cosp.geometry.statistics import nmad  # noqa: E402
 from cosp.io import rasters, records, tables  # noqa: E402
 from cosp.matching.footprint import Footprint  # noqa: E402
 from cosp.matching.ground import ground_pixel_m, lattice_rc  # noqa: E402
 from cosp.matching.matchers import matcher_by_name  # noqa: E402
 from cosp.simulation.site import SiteSettings, plan_site  # noqa: E402
-from cosp.simulation.truth import true_film_coordinates  # noqa: E402
+from cosp.simulation.truth import true_part_pixels  # noqa: E402
 from scripts.collect_gcps import collect_gcps  # noqa: E402
 from scripts.match_tiles import match_tiles  # noqa: E402
 
 MATCHERS = "structural,sift,lightglue:xfeat,lightglue:disk"
 RIGHT_PX = 3.0
-# Degree along and across the film of what joining leaves: scale, origin, turns of the parts.
-DEGREES = (5, 2)
 BANDS = (3, 4)
 
 
@@ -71,16 +71,29 @@ def settings_of(folder: Path) -> tuple[dict, str]:
     return sheets.fill_defaults(sheets.schema("config"), written), next(iter(written["sites"]))
 
 
-def smooth_part(xy_mm: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Polynomial of the film coordinates that most values (N, 2) follow, at the same points."""
-    x, y = (xy_mm / np.abs(xy_mm).max(axis=0)).T
-    design = np.stack([x**i * y**j for i in range(DEGREES[0] + 1) for j in range(DEGREES[1] + 1)], axis=1)
-    weights = np.ones(len(x))
-    for _ in range(20):
-        fit = design @ np.linalg.lstsq(design * weights[:, None], values * weights[:, None], rcond=None)[0]
-        miss = np.linalg.norm(values - fit, axis=1)
-        weights = 1 / np.maximum(miss, 1.5 * np.median(miss))
-    return fit
+def film_errors_mm(folder: Path, site: str, scene: str, xy_mm: np.ndarray, lonlath: np.ndarray) -> np.ndarray:
+    """Film points less where the simulator drew their ground points, (N, 2) mm: both taken to pixels of the parts."""
+    results = folder / "results" / "scenes" / scene
+    film, seams = (records.read_json(results / name) for name in ("film.json", "seams.json"))
+    if any(seams["turned"]) or any(seams["mirrored"]):
+        raise SystemExit(f"{scene}: parts that are turned or mirrored are not provided for")
+    bending = records.from_plain(film["bending"], Bending, "film.json")
+    exposure = records.from_plain(film["exposure"], Exposure, "film.json")
+    layout = records.from_plain(seams["layout"], Layout, "seams.json")
+    truth = records.read_json(folder / f"resources/simulated/{site}/truth/site.json")
+    plan = plan_site(SiteSettings(**truth["settings"]))
+    # The record is that of the film as it was delivered: an aft film was turned afterwards.
+    through_its_back = records.read(results / "footprint.json", Footprint).mirrored
+    sign = np.array([1, -1 if through_its_back else 1]) * (-1 if film["turned"] else 1)
+    rows, columns = exposure.pixels(bending.bent(xy_mm * sign))
+    of_part = np.searchsorted(layout.joints_px, columns)
+    error = np.empty_like(xy_mm)
+    for number, (name, motion) in enumerate(zip(seams["part_order"], layout.motions, strict=True)):
+        mine = of_part == number
+        column, row = motion.inverse().apply(np.column_stack([columns[mine], rows[mine]])).T
+        true = true_part_pixels(plan, plan.scene(scene), name[-1], lonlath[mine])
+        error[mine] = np.column_stack([column - true[:, 1], true[:, 0] - row]) * exposure.pixel_mm
+    return error * sign
 
 
 def measure(folder: Path, scene: str, name: str, target: Path) -> dict:
@@ -110,18 +123,9 @@ def measure(folder: Path, scene: str, name: str, target: Path) -> dict:
     px_mm = film_mm * posting_m / ground_pixel_m(camera, film_mm, 1000.0)
     gcps = tables.read(gcps_path)
     kept = gcps[gcps["role"] != "rejected"]
-    truth = records.read_json(folder / f"resources/simulated/{site}/truth/site.json")
-    plan = plan_site(SiteSettings(**truth["settings"]))
-
-    film = records.read_json(results / "film.json")
-    bending = records.from_plain(film["bending"], Bending, "film.json")
-    # The bending is that of the film as it was delivered: an aft film was turned afterwards.
-    through_its_back = records.read(results / "footprint.json", Footprint).mirrored
-    sign = np.array([1, -1 if through_its_back else 1]) * (-1 if film["turned"] else 1)
     xy = kept[["x_mm", "y_mm"]].to_numpy()
     lonlath = kept[["longitude_deg", "latitude_deg", "height_m"]].to_numpy()
-    off = bending.bent(xy * sign) * sign - true_film_coordinates(plan, plan.scene(scene), lonlath)
-    error_mm = off - smooth_part(xy, off)
+    error_mm = film_errors_mm(folder, site, scene, xy, lonlath)
     error_px = np.linalg.norm(error_mm, axis=1) / px_mm
     claimed_mm = kept[["sigma_x_px", "sigma_y_px"]].to_numpy() * film_mm
     summary = records.read_json(summary_path)

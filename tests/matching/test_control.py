@@ -57,13 +57,14 @@ def matches_of(film_mm, lonlath, sigma_px=0.4, pixel_mm=0.14, rng=None):
             "score": 0.6,
             "sigma_px": sigma_px,
             "posting_m": 40.0,
+            "template_px": 25,
         }
     )
 
 
 def own_points(film_mm, lonlath, **more):
     columns = {"height_m": np.nan, "sigma_px": 1.0, "sigma_ground_m": np.nan, "sigma_height_m": np.nan, **more}
-    table = matches_of(film_mm, lonlath).drop(columns=["score", "posting_m", "sigma_px"])
+    table = matches_of(film_mm, lonlath).drop(columns=["score", "posting_m", "template_px", "sigma_px"])
     return table.assign(**columns)
 
 
@@ -110,6 +111,21 @@ def test_good_matches_become_control_and_check_and_gross_errors_are_rejected():
     assert 0.5 < summary["residual_over_sigma"]["x"] <= 1.1
     assert (kept["sigma_x_px"] > kept["sigma_px"]).all()
     assert kept["sigma_height_m"].between(4.0, np.hypot(4.0, 0.3 * 3.0) + 0.01).all()
+
+
+def test_what_a_matcher_states_is_scaled_by_what_neighbours_say():
+    camera, rng = make_camera(), np.random.default_rng(9)
+    matches = matches_of(*film_points(camera, rng, 1500), sigma_px=0.3, rng=rng)
+    own = own_points(*film_points(camera, rng, 5))
+    gcps, summary = gathered(matches.assign(sigma_px=1.5), camera, own=own)
+    assert 0.9 * 0.2 < summary["sigma_factor"] < 1.25 * 0.2
+    points = gcps.groupby("source")["sigma_px"]
+    np.testing.assert_allclose(points.get_group("match"), 1.5 * summary["sigma_factor"])
+    assert (points.get_group("own") == 1.0).all()
+    alone = film_lattice(HALF_LENGTH_MM * 0.95, HALF_WIDTH_MM * 0.95, 40, 5)
+    _, summary = gathered(matches_of(alone, ground_of(camera, alone)), camera)
+    assert summary["sigma_factor"] is None
+    assert summary["median_sigma_px"] == 0.4
 
 
 def test_points_on_a_lake_are_left_out_but_not_those_of_a_plain_in_whole_metres():
