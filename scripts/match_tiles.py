@@ -31,7 +31,8 @@ def match_tiles(
     candidates,
     features,
     max_features,
-    tile_px,
+    tile_width_px,
+    tile_height_px,
     superglue_weights,
     threads,
 ):
@@ -66,6 +67,7 @@ def match_tiles(
         reference_posting_m=reference_posting_m,
     )
     if matcher in LEARNED:
+        tile_px = (tile_height_px, tile_width_px)
         matches = match_wide_strip(placed, scatteritem, matcher=chosen, tile_px=tile_px, threads=threads)
     else:
         tiles_mm = control_tiles(camera, candidates)
@@ -112,7 +114,8 @@ if __name__ == "__main__":
             candidates=snakemake.params.candidates,
             features=snakemake.params.features,
             max_features=snakemake.params.max_features,
-            tile_px=snakemake.params.tile_px,
+            tile_width_px=snakemake.params.tile_width_px,
+            tile_height_px=snakemake.params.tile_height_px,
             superglue_weights=snakemake.params.superglue_weights,
             threads=snakemake.threads,
         )

@@ -192,11 +192,15 @@ def reduction_for(posting_m: float, pixel_m: float) -> int:
     return max(1, int(posting_m / pixel_m + 0.05))
 
 
-def tile_about(easting: float, northing: float, posting_m: float, size_px: int) -> PixelGrid:
-    """Square north-up grid about a map point, pixel edges on whole multiples of the posting."""
-    left = math.floor(easting / posting_m) - size_px // 2
-    top = math.floor(northing / posting_m) + size_px // 2
-    return PixelGrid((left + 0.5) * posting_m, (top + 0.5) * posting_m, posting_m, -posting_m, (size_px, size_px))
+def tile_about(easting: float, northing: float, posting_m: float, size_px: int | tuple[int, int]) -> PixelGrid:
+    """North-up grid about a map point, pixel edges on whole multiples of the posting.
+
+    size_px : side of a square, or (rows, columns)
+    """
+    rows, columns = (size_px, size_px) if isinstance(size_px, int) else size_px
+    left = math.floor(easting / posting_m) - columns // 2
+    top = math.floor(northing / posting_m) + rows // 2
+    return PixelGrid((left + 0.5) * posting_m, (top + 0.5) * posting_m, posting_m, -posting_m, (rows, columns))
 
 
 def project_film(film: FilmImage, projector: MapProjector, grid: PixelGrid, heights_m: FloatArray) -> Float32Array:
@@ -247,7 +251,7 @@ def match_film_to_ground(
     terrain: Terrain,
     matcher: Matcher,
     posting_m: float,
-    tile_px: int,
+    tile_px: int | tuple[int, int],
     step_px: int,
     margin_px: int,
     threads: int,
@@ -264,8 +268,8 @@ def match_film_to_ground(
         Reference image and ellipsoidal heights on a map grid.
     posting_m : float
         Of the map tiles.
-    tile_px : int
-        Side of a tile.
+    tile_px : int or (rows, columns)
+        Side of a tile, or both.
     step_px : int
         Distance of the points that are asked of the matcher.
     margin_px : int
@@ -273,7 +277,7 @@ def match_film_to_ground(
     threads : int
         Tiles worked on at once.
     """
-    projector = MapProjector(camera, terrain.crs, grown(terrain.grid.bounds, 0.6 * tile_px * posting_m))
+    projector = MapProjector(camera, terrain.crs, grown(terrain.grid.bounds, 0.6 * np.max(tile_px) * posting_m))
     places = terrain.map_points(camera, film_points_mm)
     places = places[np.isfinite(places).all(axis=1)]
 
@@ -386,7 +390,7 @@ class PlacedFilm:
         tiles_mm: FloatArray,
         *,
         matcher: Matcher,
-        tile_px: int,
+        tile_px: int | tuple[int, int],
         step_px: int,
         margin_px: int,
         threads: int,
@@ -394,7 +398,7 @@ class PlacedFilm:
         """Matches of tiles about film points, as `match_film_to_ground` gives them; none for no tile."""
         if not len(tiles_mm):
             return GroundMatches.joined([])
-        reach_mm = self.on_film_mm(tile_px)  # half a tile and the slant of a map square on the film
+        reach_mm = self.on_film_mm(np.max(tile_px))  # half a tile and the slant of a map square on the film
         part = self.film.part(float(tiles_mm[:, 0].min()) - reach_mm, float(tiles_mm[:, 0].max()) + reach_mm)
         matches = match_film_to_ground(
             part.reduced(reduction_for(self.posting_m, self.pixel_m)),

@@ -8,19 +8,19 @@ from cosp.imaging.windows import strip_of
 from cosp.matching.ground import GroundMatches, PlacedFilm, film_lattice
 from cosp.matching.matchers import Matcher
 
-# Neighbouring tiles overlap by a fifth: north-up squares on a strip that lies aslant.
+# Neighbouring tiles overlap by a fifth: north-up rectangles on a strip that lies aslant.
 _STEP_SHARE = 0.8
 
 
-def wide_tiles(camera: PanoramicCamera, tile_mm: float) -> FloatArray:
-    """Film points (N, 2), in order along the film, about which square tiles of a side cover it."""
-    step = _STEP_SHARE * tile_mm
-    columns, rows = (max(1, round(2 * half / step)) for half in (camera.half_length_mm, camera.half_width_mm))
+def wide_tiles(camera: PanoramicCamera, length_mm: float, width_mm: float) -> FloatArray:
+    """Film points (N, 2), in order along the film, about which tiles of a length and a width cover it."""
+    halves, sides = (camera.half_length_mm, camera.half_width_mm), (length_mm, width_mm)
+    columns, rows = (max(1, round(2 * h / (_STEP_SHARE * side))) for h, side in zip(halves, sides, strict=True))
     return film_lattice(camera.half_length_mm, camera.half_width_mm, columns, rows)
 
 
 def match_wide_strip(
-    placed: PlacedFilm, scatteritem: str, *, matcher: Matcher, tile_px: int, threads: int
+    placed: PlacedFilm, scatteritem: str, *, matcher: Matcher, tile_px: tuple[int, int], threads: int
 ) -> GroundMatches:
     """Matches of a strip of a placed film.
 
@@ -30,17 +30,19 @@ def match_wide_strip(
     scatteritem : str
         Which strip of how many, such as "3-of-16"; there may be fewer tiles than strips.
     matcher : Matcher
-    tile_px : int
-        Side of a tile.
+    tile_px : (rows, columns)
+        Of a tile on the map, whose columns run about along the film.
     threads : int
     """
-    tiles_mm = wide_tiles(placed.camera, placed.on_film_mm(tile_px))
+    rows, columns = tile_px
+    tiles_mm = wide_tiles(placed.camera, placed.on_film_mm(columns), placed.on_film_mm(rows))
     first, last = strip_of(len(tiles_mm), scatteritem)
+    # Such a matcher looks for points of its own: the one that is asked for is the middle.
     return placed.match(
         tiles_mm[first:last],
         matcher=matcher,
         tile_px=tile_px,
-        step_px=tile_px,
-        margin_px=tile_px // 2,
+        step_px=max(tile_px),
+        margin_px=min(tile_px) // 2 - 1,
         threads=threads,
     )

@@ -72,6 +72,10 @@ def test_a_tile_lies_about_its_point_on_whole_postings():
     grid = tile_about(1234.0, 5678.0, 15.0, 100)
     assert abs((grid.bounds[0] + grid.bounds[2]) / 2 - 1234.0) < 15.0
     assert grid.bounds[0] % 15.0 == 0.0
+    wide = tile_about(1234.0, 5678.0, 15.0, (80, 120))
+    assert wide.shape == (80, 120)
+    assert abs((wide.bounds[0] + wide.bounds[2]) / 2 - 1234.0) < 15.0
+    assert abs((wide.bounds[1] + wide.bounds[3]) / 2 - 5678.0) < 15.0
 
 
 def test_terrain_outside_the_elevation_model_is_an_error():
