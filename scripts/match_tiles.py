@@ -28,6 +28,9 @@ def match_tiles(
     min_score,
     max_ratio,
     max_return_px,
+    relief_template_px,
+    relief_min_score,
+    relief_max_ratio,
     candidates,
     features,
     max_features,
@@ -46,6 +49,7 @@ def match_tiles(
     else:
         reference_on = relief_reference(heights_on, footprint.sun_azimuth_deg, footprint.sun_elevation_deg)
         reference_posting_m = references.posting_m(reference_dem_path)
+        template_px, min_score, max_ratio = relief_template_px, relief_min_score, relief_max_ratio
     film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
     chosen = matcher_by_name(
         matcher,
@@ -111,6 +115,9 @@ if __name__ == "__main__":
             min_score=snakemake.params.min_score,
             max_ratio=snakemake.params.max_ratio,
             max_return_px=snakemake.params.max_return_px,
+            relief_template_px=snakemake.params.relief_template_px,
+            relief_min_score=snakemake.params.relief_min_score,
+            relief_max_ratio=snakemake.params.relief_max_ratio,
             candidates=snakemake.params.candidates,
             features=snakemake.params.features,
             max_features=snakemake.params.max_features,

@@ -1,14 +1,16 @@
 """Matchers side by side: on a simulated site against its truth, and on two real images of one place.
 
     python tests/benchmarks/matchers.py --make NEW_FOLDER [--pixel-um 56] [--matchers structural,sift,lightglue:xfeat]
-    python tests/benchmarks/matchers.py --folder SITE
+    python tests/benchmarks/matchers.py --folder SITE [--reference relief]
+    python tests/benchmarks/matchers.py --folder SITE --reference-m 3 [--stretch-mm 40] [--reference-error-m 1]
     COSP_TEST_DATA=... python tests/benchmarks/matchers.py --real
 
 --make simulates a site in a new folder and takes it as far as placed films; --folder takes one that has come so far,
 and only reads it. Each matcher runs in a process of its own, through the scripts of the rules match_tiles and
 collect_gcps, so that its time and memory are those of the workflow. The true residual of a point is where it was
 measured on the film, taken back to the digitised part it came from, less where the simulator drew its ground point in
-that part.
+that part. --reference relief leaves the reference image out; --reference-m makes one of another posting for the
+middle of the film.
 
 On the real images (Landsat 7, 20 July and 25 November 2002) a match is right within 3 px of where it should be; the
 two images themselves lie 0.9 px apart.
@@ -24,6 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,18 +40,21 @@ from cosp.errors import CospError  # noqa: E402
 from cosp.film.bending import Bending  # noqa: E402
 from cosp.film.exposure import Exposure  # noqa: E402
 from cosp.film.joining import Layout  # noqa: E402
-from cosp.geometry.statistics import nmad  # noqa: E402
 from cosp.io import rasters, records, tables  # noqa: E402
+from cosp.io.heights import ellipsoidal_heights  # noqa: E402
 from cosp.matching.footprint import Footprint  # noqa: E402
-from cosp.matching.ground import ground_pixel_m, lattice_rc  # noqa: E402
+from cosp.matching.ground import ground_pixel_m, lattice_rc, map_bounds  # noqa: E402
 from cosp.matching.matchers import matcher_by_name  # noqa: E402
+from cosp.simulation.reference import make_reference_image  # noqa: E402
 from cosp.simulation.site import SiteSettings, plan_site  # noqa: E402
+from cosp.simulation.terrain import MODERN_EPOCH, Scenery, light_terrain, make_terrain  # noqa: E402
 from cosp.simulation.truth import true_part_pixels  # noqa: E402
 from scripts.collect_gcps import collect_gcps  # noqa: E402
 from scripts.match_tiles import match_tiles  # noqa: E402
 
 MATCHERS = "structural,sift,lightglue:xfeat,lightglue:disk"
 RIGHT_PX = 3.0
+SUN_ERROR_DEG = 12.0
 BANDS = (3, 4)
 
 
@@ -96,8 +102,31 @@ def film_errors_mm(folder: Path, site: str, scene: str, xy_mm: np.ndarray, lonla
     return error * sign
 
 
-def measure(folder: Path, scene: str, name: str, target: Path) -> dict:
-    """One matcher on one film, with the scripts of the workflow; what came out, against the truth."""
+def make_reference(folder: Path, scene: str, target: Path, posting_m: float, error_m: float, stretch_mm: float) -> None:
+    """A reference image of another posting, of what the middle of a film shows, as the simulator makes them."""
+    settings, site = settings_of(folder)
+    truth = records.read_json(folder / f"resources/simulated/{site}/truth/site.json")["settings"]
+    plan = plan_site(SiteSettings(**{**truth, "reference_image_m": posting_m, "reference_image_error_m": error_m}))
+    dem = plan.settings.dem
+    heights = None if dem is None else ellipsoidal_heights(dem, plan.terrain_grid, plan.crs, plan.settings.dem_heights)
+    scenery = light_terrain(plan, make_terrain(plan, heights, threads=1), MODERN_EPOCH, threads=1)
+    camera = records.read(folder / "results" / "scenes" / scene / "footprint.json", Footprint).camera
+    middle = replace(camera, half_length_mm=stretch_mm / 2)
+    xmin, ymin, xmax, ymax = map_bounds(middle, plan.crs, (0.0, 3000.0))
+    rows, columns = plan.terrain_grid.pixels(np.array([[xmin, ymax], [xmax, ymin]])).astype(int)
+    inside = np.s_[rows[0] : rows[1], columns[0] : columns[1]]
+    part = replace(plan, terrain_grid=plan.terrain_grid.window(rows[0], rows[1], columns[0], columns[1]))
+    scenery = Scenery(*(np.ascontiguousarray(band[inside]) for band in (scenery.radiance, scenery.strength)))
+    rng = np.random.default_rng([plan.settings.seed, 42])
+    image, grid = make_reference_image(part, scenery, rng, threads=1)
+    rasters.write(target, image, grid=grid, crs=plan.crs, nodata=0)
+
+
+def measure(folder: Path, scene: str, name: str, reference: str, target: Path) -> dict:
+    """One matcher on one film, with the scripts of the workflow; what came out, against the truth.
+
+    reference : "image" of the site, "relief" of its DEM, or the path of another image
+    """
     settings, site = settings_of(folder)
     matcher, _, features = name.partition(":")
     chosen = {**settings["match_tiles"], "matcher": matcher}
@@ -105,10 +134,21 @@ def measure(folder: Path, scene: str, name: str, target: Path) -> dict:
         chosen["features"] = features
     sites = {key: settings["sites"][site][key] for key in ("reference_dem", "reference_image", "unstable_terrain")}
     paths = {key: None if path is None else folder / path for key, path in sites.items()}
+    if reference != "image":
+        paths["reference_image"] = None if reference == "relief" else Path(reference)
     results = folder / "results" / "scenes" / scene
+    footprint_path = results / "footprint.json"
+    if reference == "relief":
+        # A film placed by imagery says nothing about the sun; one placed by relief finds it to some degrees.
+        azimuth = records.read_json(folder / f"resources/simulated/{site}/truth/site.json")["settings"][
+            "sun_azimuth_deg"
+        ]
+        footprint_path = target / "footprint.json"
+        placed = records.read(results / "footprint.json", Footprint)
+        records.write(footprint_path, replace(placed, sun_azimuth_deg=azimuth + SUN_ERROR_DEG))
     heights = {"reference_dem_heights": settings["sites"][site]["reference_dem_heights"]}
     matches_path, gcps_path, summary_path = (target / n for n in ("matches.parquet", "gcps.parquet", "gcps.json"))
-    common = (results / "film.tif", results / "footprint.json", paths["reference_dem"])
+    common = (results / "film.tif", footprint_path, paths["reference_dem"])
     began = time.process_time()
     match_tiles(
         *common, paths["reference_image"], matches_path, scatteritem="1-of-1", **heights, **chosen, threads=1
@@ -121,23 +161,24 @@ def measure(folder: Path, scene: str, name: str, target: Path) -> dict:
     camera = records.read(results / "footprint.json", Footprint).camera
     film_mm = abs(rasters.info(results / "film.tif").grid.step_x)
     px_mm = film_mm * posting_m / ground_pixel_m(camera, film_mm, 1000.0)
-    gcps = tables.read(gcps_path)
+    gcps, summary = tables.read(gcps_path), records.read_json(summary_path)
     kept = gcps[gcps["role"] != "rejected"]
     xy = kept[["x_mm", "y_mm"]].to_numpy()
     lonlath = kept[["longitude_deg", "latitude_deg", "height_m"]].to_numpy()
     error_mm = film_errors_mm(folder, site, scene, xy, lonlath)
     error_px = np.linalg.norm(error_mm, axis=1) / px_mm
     claimed_mm = kept[["sigma_x_px", "sigma_y_px"]].to_numpy() * film_mm
-    summary = records.read_json(summary_path)
     return {
         "scene": scene,
         "matcher": name,
-        "px": f"{posting_m:.0f} m",
+        "reference": Path(reference).stem,
+        "px": f"{posting_m:.1f} m",
         "matches": len(matches),
         "gcps": len(kept),
         "median_px": float(np.median(error_px)),
         "beyond_3_px": float((error_px > RIGHT_PX).mean()),
-        "error/sigma": nmad(error_mm / claimed_mm),
+        "error/sigma": float(np.sqrt(np.mean(np.clip(error_mm / claimed_mm, -5, 5) ** 2))),
+        "sigma_factor": summary["sigma_factor"],
         "cells": summary["coverage"]["cells"],
         "seconds": taken,
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
@@ -209,7 +250,11 @@ def main() -> int:
     parser.add_argument("--matchers", default=MATCHERS)
     parser.add_argument("--scenes", type=int, default=1, help="films to match")
     parser.add_argument("--real", action="store_true", help="the real images instead of a site")
-    parser.add_argument("--one", nargs=2, metavar=("SCENE", "MATCHER"), help=argparse.SUPPRESS)
+    parser.add_argument("--reference", default="image", help="image of the site, relief of its DEM, or an image file")
+    parser.add_argument("--reference-m", type=float, help="make a reference image of this posting, of --stretch-mm")
+    parser.add_argument("--reference-error-m", type=float, default=1.0)
+    parser.add_argument("--stretch-mm", type=float, default=40.0, help="of the film about its middle")
+    parser.add_argument("--one", nargs=3, metavar=("SCENE", "MATCHER", "REFERENCE"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     names = options.matchers.split(",")
     if options.real:
@@ -232,14 +277,29 @@ def main() -> int:
     if not scenes:
         parser.error("no placed film; name a site by --folder, or a new folder by --make")
     rows = []
-    for scene in scenes[: options.scenes]:
-        for name in names:
-            command = [sys.executable, str(Path(__file__)), "--folder", str(folder), "--one", scene, name]
-            done = subprocess.run(command, capture_output=True, text=True)
-            if done.returncode:
-                print(f"skipped {name}: {done.stderr.strip().splitlines()[-1]}")
-                continue
-            rows.append(json.loads(done.stdout.splitlines()[-1]))
+    with tempfile.TemporaryDirectory() as scratch:
+        for scene in scenes[: options.scenes]:
+            reference = options.reference
+            if options.reference_m:
+                reference = f"{scratch}/{options.reference_m:g} m.tif"
+                made = (options.reference_m, options.reference_error_m, options.stretch_mm)
+                make_reference(folder, scene, Path(reference), *made)
+            for name in names:
+                command = [
+                    sys.executable,
+                    str(Path(__file__)),
+                    "--folder",
+                    str(folder),
+                    "--one",
+                    scene,
+                    name,
+                    reference,
+                ]
+                done = subprocess.run(command, capture_output=True, text=True)
+                if done.returncode:
+                    print(f"skipped {name}: {done.stderr.strip().splitlines()[-1]}")
+                    continue
+                rows.append(json.loads(done.stdout.splitlines()[-1]))
     show(rows)
     return 0
 
