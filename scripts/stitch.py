@@ -7,6 +7,7 @@ import numpy as np
 
 from cosp.errors import InputError
 from cosp.film.arrangement import SeamLimits, arrange, posed
+from cosp.film.continuity import measure_continuity
 from cosp.film.joining import lay_out
 from cosp.film.scanner import find_steps, measure_overlap, steps_of_parts, without_steps
 from cosp.film.stitching import refine_seam, require_part
@@ -86,20 +87,19 @@ def stitch(
         )
         for k, seam in enumerate(seams)
     ]
-    found, blocks = find_steps(
+    found, boundaries, blocks = find_steps(
         overlaps,
         [seam.motion for seam in seams],
-        widths_px=[part.shape[1] for part in laid],
-        turned=[pose.turned for pose in arrangement.poses],
+        [measure_continuity(part, reach_px=step_search_px, threads=threads) for part in laid],
         pixel_mm=pixel_mm,
         min_significance=step_significance,
         min_step_px=min_step_px,
         tolerance_mm=step_tolerance_mm,
     )
-    steps = steps_of_parts(found)
+    steps = steps_of_parts(found, boundaries)
     for k, jumps in enumerate(found):
         log.info("seam %d/%d: %d steps of the scanner", k + 1, len(seams), len(jumps))
-        if jumps:
+        if jumps or steps[k].columns_px or steps[k + 1].columns_px:
             seams[k] = without_steps(seams[k], overlaps[k], steps[k], steps[k + 1])
 
     layout = lay_out([part.shape for part in laid], seams, feather_px=feather_mm / pixel_mm, steps=steps)
@@ -123,6 +123,7 @@ def stitch(
             "mirrored": [pose.mirrored for pose in arrangement.poses],
             "margin": arrangement.margin,
             "scanner_blocks": blocks,
+            "steps_between_overlaps": boundaries,
             "layout": layout,
             "seams": [
                 {

@@ -9,7 +9,9 @@ from typing import Literal
 import numpy as np
 
 from cosp.arrays import ByteArray, FloatArray
+from cosp.film.continuity import Boundary, Continuity
 from cosp.film.stitching import GATE_PX, Seam, correlate_patches, robust_rigid, thinned
+from cosp.geometry.robust import huber_weights
 from cosp.geometry.statistics import nmad
 from cosp.geometry.transforms import Rigid, estimate_rigid
 
@@ -102,10 +104,15 @@ class Jump:
 
 @dataclass(frozen=True)
 class Blocks:
-    """The blocks of the scanner: a boundary at `first_mm` and every `spacing_mm` from there, along every part."""
+    """The blocks of the scanner: along each part a boundary every `spacing_mm`, one of them at `first_mm` (or None)."""
 
     spacing_mm: float
-    first_mm: float
+    first_mm: tuple[float | None, ...]
+
+    def along(self, part: int, length_mm: float) -> FloatArray:
+        """Boundaries of a part, mm from its first column; none where the part shows no block."""
+        first = self.first_mm[part]
+        return np.empty(0) if first is None else np.arange(first % self.spacing_mm, length_mm, self.spacing_mm)
 
 
 def measure_overlap(
@@ -270,13 +277,13 @@ def _boundary(x: FloatArray, values: FloatArray, starts: list[int], k: int, size
     return float(x[near.start] - spacing / 2 + spacing * (1.0 - passed).sum())
 
 
-def find_blocks(places_mm: Sequence[tuple[float, float]], *, part_mm: float, tolerance_mm: float) -> Blocks | None:
-    """Spacing of the scanner's blocks, where the steps of all overlaps fall on one comb beyond chance.
+def find_blocks(places_mm: Sequence[FloatArray], *, part_mm: float, tolerance_mm: float) -> Blocks | None:
+    """Spacing of the scanner's blocks, where breaks of the picture fall on combs of one spacing beyond chance.
 
     Parameters
     ----------
-    places_mm : (left, right) of each step
-        Where it lies along the left and along the right part, as they were digitised.
+    places_mm : (N,) array of each part
+        Breaks of its picture.
     part_mm : float
         Length of the longest part.
     tolerance_mm : float
@@ -287,88 +294,220 @@ def find_blocks(places_mm: Sequence[tuple[float, float]], *, part_mm: float, tol
     Blocks or None
         None where chance would explain it too.
     """
-    if len(places_mm) < 3:
-        return None
-    left, right = np.array(places_mm, float).T
     ratio = 1.0 + tolerance_mm / part_mm
     spacings = _SPACINGS_MM[0] * ratio ** np.arange(int(np.log(_SPACINGS_MM[1] / _SPACINGS_MM[0]) / np.log(ratio)) + 1)
-    best = (0.0, 0.0, 0.0)
-    for first in np.r_[left, right]:
-        gaps = [np.abs((side - first + b / 2) % b - b / 2) for side in (left, right) for b in [spacings[:, None]]]
-        explained = (np.minimum(*gaps) < tolerance_mm).sum(axis=1)
-        # Each step explained is worth its chance to lie on the comb of either part; the first one gave the phase.
-        worth = (explained - 1) * np.log(np.maximum(spacings / (4.0 * tolerance_mm), 1.0))
-        worth = np.where(explained >= 0.75 * len(left), worth, 0.0)
-        k = int(worth.argmax())
-        if worth[k] > best[0]:
-            best = (float(worth[k]), float(spacings[k]), float(first % spacings[k]))
-    if best[0] < np.log(20.0 * len(spacings) * 2 * len(left)):
+    worth, trials = np.zeros(len(spacings)), 0.0
+    firsts: list[FloatArray | None] = []
+    for places in places_mm:
+        count, first = np.zeros(len(spacings)), np.zeros(len(spacings))
+        for place in places:  # each in turn gives the phase
+            off = (places - place + spacings[:, None] / 2) % spacings[:, None] - spacings[:, None] / 2
+            on = np.abs(off) < tolerance_mm
+            better = on.sum(axis=1) > count
+            count[better] = on.sum(axis=1)[better]
+            first[better] = np.asarray(place + np.where(on, off, 0.0).sum(axis=1) / np.maximum(on.sum(axis=1), 1))[
+                better
+            ]
+        firsts.append(first if len(places) else None)
+        # Log likelihood of so many places on the comb beside that of chance; one place gave the phase.
+        chance = np.minimum(2.0 * tolerance_mm / spacings, 0.5)
+        share = np.clip((count - 1) / max(len(places), 1), chance, 1.0 - 1e-9)
+        worth += len(places) * (share * np.log(share / chance) + (1 - share) * np.log((1 - share) / (1 - chance)))
+        trials += np.log(max(len(places), 1))
+    k = int(worth.argmax())
+    if worth[k] < np.log(20.0 * len(spacings)) + trials:
         return None
-    return Blocks(best[1], best[2])
+    return _refined(
+        Blocks(float(spacings[k]), tuple(None if f is None else float(f[k]) for f in firsts)), places_mm, tolerance_mm
+    )
 
 
-def attributed(jump: Jump, blocks: Blocks | None, place_mm: tuple[float, float], *, tolerance_mm: float) -> Jump:
-    """The step with the part it belongs to, if it lies on the blocks of one part only."""
-    if blocks is None:
-        return jump
-    b = blocks.spacing_mm
-    on = [abs((place - blocks.first_mm + b / 2) % b - b / 2) < tolerance_mm for place in place_mm]
-    if on[0] == on[1]:
-        return jump
-    return replace(jump, belongs_to="left" if on[0] else "right")
+def _refined(blocks: Blocks, places_mm: Sequence[FloatArray], tolerance_mm: float) -> Blocks:
+    """Spacing and first boundaries through the breaks near them, by least squares."""
+    for _ in range(3):
+        rows, target = [], []
+        for k, (first, places) in enumerate(zip(blocks.first_mm, places_mm, strict=True)):
+            if first is None:
+                continue
+            number = np.rint((places - first) / blocks.spacing_mm)
+            near = np.abs(places - first - number * blocks.spacing_mm) < tolerance_mm
+            rows.append(np.column_stack([number[near], np.tile(np.eye(len(places_mm))[k], (near.sum(), 1))]))
+            target.append(places[near])
+        solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(target), rcond=None)[0]
+        firsts = [None if old is None else float(new) for old, new in zip(blocks.first_mm, solution[1:], strict=True)]
+        blocks = Blocks(float(solution[0]), tuple(firsts))
+    return blocks
 
 
 def find_steps(
     overlaps: Sequence[Overlap],
     motions: Sequence[Rigid],
+    continuities: Sequence[Continuity],
     *,
-    widths_px: Sequence[int],
-    turned: Sequence[bool],
     pixel_mm: float,
     min_significance: float,
     min_step_px: float,
     tolerance_mm: float,
-) -> tuple[list[tuple[Jump, ...]], Blocks | None]:
-    """Steps of each overlap with the part that each belongs to, and the blocks that tell it.
+) -> tuple[list[tuple[Jump, ...]], list[tuple[Boundary, ...]], Blocks | None]:
+    """Steps of each overlap with the part that each belongs to, steps between the overlaps, and the scanner's blocks.
+
+    Where the pictures of the parts break on combs of one spacing, these are the blocks: at each of their boundaries the
+    step is what the break and, in an overlap, the residuals say together. A step of an overlap that lies on no block
+    belongs to the part whose picture breaks there; where neither does, to either.
 
     Parameters
     ----------
     overlaps : Overlap of each seam
     motions : Rigid of each seam
         Right part to left part.
-    widths_px : int of each part
-        Columns.
-    turned : bool of each part
-        Whether it lies turned by 180 degrees: blocks are counted from its first column as it was digitised.
+    continuities : Continuity of each part
     pixel_mm : float
     min_significance, min_step_px : float
         See `find_jumps`.
     tolerance_mm : float
-        Of a step's place; never less than a third of a patch.
+        Of a boundary's place; never less than a pixel and a half.
+
+    Returns
+    -------
+    jumps : of each overlap
+    boundaries : of each part
+        Those that no overlap holds.
+    blocks : Blocks or None
     """
-    found = [
-        find_jumps(overlap, motion, min_significance=min_significance, min_step_px=min_step_px)
-        for overlap, motion in zip(overlaps, motions, strict=True)
+    tolerance = max(tolerance_mm, 1.5 * pixel_mm)
+    reach = int(np.ceil(tolerance / pixel_mm))
+    breaks = [continuity.break_columns(min_significance) for continuity in continuities]
+    part_mm = max(continuity.part.shape[1] for continuity in continuities) * pixel_mm
+    blocks = find_blocks([columns * pixel_mm for columns in breaks], part_mm=part_mm, tolerance_mm=tolerance)
+    known: list[list[Boundary]] = []
+    for k, continuity in enumerate(continuities):
+        places = np.empty(0) if blocks is None else blocks.along(k, continuity.part.shape[1] * pixel_mm)
+        known.append([continuity.strongest(place / pixel_mm, reach) for place in places])
+    found: list[tuple[Jump, ...]] = []
+    for k, (overlap, motion) in enumerate(zip(overlaps, motions, strict=True)):
+        inside = [_inside(overlap, boundary, motion, side) for side in (0, 1) for boundary in known[k + side]]
+        here = [candidate for candidate in inside if candidate is not None]
+        jumps, model = _sized(overlap, here)
+        rest = replace(overlap, shift_px=overlap.shift_px - model)
+        loose = find_jumps(rest, motion, min_significance=min_significance, min_step_px=min_step_px)
+        shared = []
+        for jump in loose:
+            broken = [
+                (side, continuities[k + side].strongest(place, overlap.patch_px))
+                for side, place in enumerate((jump.left_px, jump.right_px))
+            ]
+            owners = [(side, boundary) for side, boundary in broken if boundary.significance >= min_significance]
+            for side, boundary in owners:
+                candidate = _inside(overlap, boundary, motion, side)
+                if candidate is not None and all(abs(boundary.column_px - b.column_px) > 2 for b in known[k + side]):
+                    known[k + side].append(boundary)
+                    here.append(candidate)
+            if not owners:
+                shared.append(jump)
+        jumps, _ = _sized(overlap, here)
+        jumps = [
+            jump for jump in jumps if jump.significance >= _LEAST_ON_COMB and np.hypot(*jump.size_px) >= min_step_px
+        ]
+        found.append(tuple(sorted([*jumps, *shared], key=lambda jump: jump.left_px)))
+        for side in (0, 1):
+            taken = [candidate.boundary for candidate in here if candidate.side == side]
+            known[k + side] = [boundary for boundary in known[k + side] if boundary not in taken]
+    kept = [
+        tuple(
+            boundary
+            for boundary in (_significant(each) for each in boundaries)
+            if np.hypot(*boundary.size_px) >= min_step_px
+        )
+        for boundaries in known
     ]
+    return found, kept, blocks
 
-    def digitised_mm(k: int, jump: Jump) -> tuple[float, float]:
-        sides = ((k, jump.left_px), (k + 1, jump.right_px))
-        left, right = (pixel_mm * (widths_px[i] - 1 - column if turned[i] else column) for i, column in sides)
-        return left, right
 
-    places = [[digitised_mm(k, jump) for jump in jumps] for k, jumps in enumerate(found)]
-    tolerance = max([tolerance_mm, *(overlap.patch_px * pixel_mm / 3 for overlap in overlaps)])
-    part_mm = max(widths_px) * pixel_mm
-    blocks = find_blocks([place for each in places for place in each], part_mm=part_mm, tolerance_mm=tolerance)
-    owned = [
-        tuple(attributed(jump, blocks, place, tolerance_mm=tolerance) for jump, place in zip(*both, strict=True))
-        for both in zip(found, places, strict=True)
+def _significant(boundary: Boundary) -> Boundary:
+    """The boundary with a size of zero along an axis where it is hardly more than its standard deviation."""
+    size = [v if abs(v) >= _LEAST_ON_COMB * sd else 0.0 for v, sd in zip(boundary.size_px, boundary.sd_px, strict=True)]
+    return replace(boundary, size_px=(size[0], size[1]))
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A boundary of the left (0) or right (1) part and its column in the left part."""
+
+    boundary: Boundary
+    side: int
+    left_px: float
+    right_px: float
+
+
+def _inside(overlap: Overlap, boundary: Boundary, motion: Rigid, side: int) -> _Candidate | None:
+    """The boundary as the overlap sees it; None where it does not."""
+    if len(overlap.column_px) < 2 * _FEWEST_COLUMNS:
+        return None
+    middle = float(np.median(overlap.points[:, 1]))
+    place = np.array([boundary.column_px, middle])
+    left = place if side == 0 else motion.apply(place)
+    right = motion.inverse().apply(place) if side == 0 else place
+    ends = overlap.column_px[[1, -2]]
+    if not ends[0] - overlap.patch_px / 2 < left[0] < ends[1] + overlap.patch_px / 2:
+        return None
+    return _Candidate(boundary, side, float(left[0]), float(right[0]))
+
+
+def _sized(overlap: Overlap, candidates: Sequence[_Candidate]) -> tuple[list[Jump], FloatArray]:
+    """Jumps at known boundaries and the curve (M, 2) they make, from the residuals and the breaks of the picture.
+
+    Least squares: a step each, over film that may wave smoothly between two scans.
+    """
+    x, values = overlap.column_px, overlap.shift_px
+    if not candidates:
+        return [], np.zeros_like(values)
+    between = np.diff(values, axis=0) / np.hypot(overlap.sd_px[1:], overlap.sd_px[:-1])[:, None]
+    sd = overlap.sd_px * max(1.0, nmad(between))
+    signs = np.array([1.0, -1.0])[[candidate.side for candidate in candidates]]
+    passed = np.clip((x[:, None] - [c.left_px for c in candidates]) / overlap.patch_px + 0.5, 0.0, 1.0)
+    # A patch on both sides of a step sees whichever side has more texture.
+    sd = np.where(((passed > 0) & (passed < 1)).any(axis=1), _STRADDLING_PX, sd)
+    nodes = np.linspace(x[0], x[-1], max(2, len(x) // _COLUMNS_A_NODE + 1))
+    waves = np.stack([np.interp(x, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
+    bends = np.diff(np.eye(len(nodes)), n=2, axis=0) / _BEND_PX
+    n, m = len(candidates), len(nodes)
+    sizes, sds = np.zeros((n, 2)), np.zeros((n, 2))
+    for axis in (0, 1):
+        prior = np.array([c.boundary.size_px[axis] for c in candidates])
+        prior_sd = np.array([max(c.boundary.sd_px[axis], _LEAST_PRIOR_PX) for c in candidates])
+        weight: FloatArray = np.ones(len(x))
+        for _ in range(6):
+            scaled = (np.sqrt(weight) / sd)[:, None]
+            design = np.vstack(
+                [
+                    np.hstack([passed * signs, waves]) * scaled,
+                    np.hstack([np.diag(1.0 / prior_sd), np.zeros((n, m))]),
+                    np.hstack([np.zeros((len(bends), n)), bends]),
+                ]
+            )
+            target = np.concatenate([values[:, axis] * scaled[:, 0], prior / prior_sd, np.zeros(len(bends))])
+            normal = np.linalg.inv(design.T @ design + 1e-9 * np.eye(n + m))
+            solution = normal @ (design.T @ target)
+            misfit = values[:, axis] - np.hstack([passed * signs, waves]) @ solution
+            weight = np.asarray(huber_weights(misfit / sd))
+        sizes[:, axis], sds[:, axis] = solution[:n], np.sqrt(np.diag(normal)[:n])
+    jumps = [
+        Jump(
+            c.left_px,
+            c.right_px,
+            (float(sign * size[0]), float(sign * size[1])),
+            float(np.hypot(*(size / deviation))),
+            "left" if c.side == 0 else "right",
+        )
+        for c, sign, size, deviation in zip(candidates, signs, sizes, sds, strict=True)
     ]
-    return owned, blocks
+    return jumps, passed @ (signs[:, None] * sizes)
 
 
-def steps_of_parts(seams: Sequence[Sequence[Jump]]) -> tuple[Steps, ...]:
-    """Steps of each part, left to right, from those of the overlaps between them; the middle of a part stays."""
+def steps_of_parts(
+    seams: Sequence[Sequence[Jump]], boundaries: Sequence[Sequence[Boundary]] | None = None
+) -> tuple[Steps, ...]:
+    """Steps of each part, left to right, from those of the overlaps and those between them (none, where not given)."""
     parts = []
     for k in range(len(seams) + 1):
         events: list[tuple[float, FloatArray]] = []
@@ -380,6 +519,8 @@ def steps_of_parts(seams: Sequence[Sequence[Jump]]) -> tuple[Steps, ...]:
         for jump in seams[k] if k < len(seams) else ():
             size = np.array(jump.size_px) * {"left": 1.0, "right": 0.0, "either": 0.5}[jump.belongs_to]
             events.append((jump.left_px, size))
+        for boundary in boundaries[k] if boundaries is not None else ():
+            events.append((boundary.column_px, np.array(boundary.size_px)))
         events = sorted((event for event in events if event[1].any()), key=lambda event: event[0])
         if not events:
             parts.append(Steps())
@@ -391,6 +532,11 @@ def steps_of_parts(seams: Sequence[Sequence[Jump]]) -> tuple[Steps, ...]:
 
 def without_steps(seam: Seam, overlap: Overlap, left: Steps, right: Steps) -> Seam:
     """The seam once the steps of both parts are taken out: motion and residuals anew."""
+    if len(overlap.points) < _FEWEST_POINTS:  # hardly a residual: the blocks in the overlap's middle move the seam
+        middle = np.array([(max(seam.motion.shift[0], 0.0) + seam.motion.shift[0] + seam.overlap_px) / 2, 0.0])
+        moved = right.at(seam.motion.inverse().apply(middle)[0]) - left.at(middle[0])
+        shift = (float(seam.motion.shift[0] + moved[0]), float(seam.motion.shift[1] + moved[1]))
+        return replace(seam, motion=Rigid(seam.motion.rotation_rad, shift))
     source = seam.motion.inverse().apply(overlap.points - overlap.residuals)
     target = overlap.points - left.at(overlap.points[:, 0])
     source = source - right.at(source[:, 0])
@@ -414,7 +560,13 @@ def without_steps(seam: Seam, overlap: Overlap, left: Steps, right: Steps) -> Se
 _PATCH_ROWS = 48
 _ROWS_OF_PATCHES = 48
 _FEWEST_PATCHES = 5  # a column with fewer says nothing
+_FEWEST_POINTS = 40  # of an overlap
 _FEWEST_COLUMNS = 3  # of a block
 _NEAR_COLUMNS = 6
 _FEWEST_FOR_A_BEND = 10  # columns, of two blocks
 _SPACINGS_MM = (4.0, 80.0)  # of the blocks of scanners
+_LEAST_ON_COMB = 3.0  # standard deviations: that there is a boundary is beyond doubt
+_STRADDLING_PX = 1.0
+_LEAST_PRIOR_PX = 0.1
+_COLUMNS_A_NODE = 8
+_BEND_PX = 0.1  # by which a film may bend between two scans from node to node

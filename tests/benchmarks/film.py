@@ -88,8 +88,8 @@ def draw(camera, number, pixel_um):
         shrinkage=float(rng.uniform(0.0, 0.002)),
         scratches=int(rng.integers(10, 60)),
         dust=int(rng.integers(100, 800)),
-        # Steps of half a pixel to one and a half of this digitisation.
-        scanner_step_px=float(rng.uniform(0.5, 1.5)) * pixel_um / 7 if stepped else 0.0,
+        # Blocks displaced by 0.3 to 0.8 of this digitisation's pixels rms: the largest steps reach two.
+        scanner_step_px=float(rng.uniform(0.3, 0.8)) * pixel_um / 7 if stepped else 0.0,
         scanner_step_mm=float(rng.uniform(12, 35)),
     )
     order = [(0, 1, 2, 3), (0, 1, 2, 3), (3, 2, 1, 0), tuple(int(i) for i in rng.permutation(4))][rng.integers(4)]
@@ -142,6 +142,8 @@ def measure(camera, number, pixel_um):
         "seam_px": found.seam_px.tolist(),
         "seam_weak": [wishes.weak_overlap == min(places[k : k + 2]) for k in range(len(letters) - 1)],
         "seam_steps": [len(seam["steps"]) for seam in seams["seams"]],
+        "step_overlap_px": found.step_overlap_px.tolist(),
+        "step_elsewhere_px": found.step_elsewhere_px.tolist(),
         "straightness_um": found.straightness_um,
         "parallel_um": found.parallel_um,
         "scale_ppm": found.scale_ppm,
@@ -197,6 +199,9 @@ def table(path, count, pixel_um):
             ],
             "{:.3f}",
         )
+    for where in ("overlap", "elsewhere"):
+        row(f"scanner step left, {where} (px)", lambda f, key=f"step_{where}_px": f[key] if f["steps"] else [])
+        row(f"false step, {where} (px)", lambda f, key=f"step_{where}_px": [] if f["steps"] else [0.0, *f[key]])
     still = lambda key, factor: lambda film: [] if film["steps"] else [abs(film[key]) * factor]  # noqa: E731
     row("straightness (px)", still("straightness_um", 1 / pixel_um))
     row("straightness (µm)", still("straightness_um", 1.0), "{:.1f}")

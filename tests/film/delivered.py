@@ -175,6 +175,9 @@ class Errors:
         Change of their distance along the film, end to end.
     scale_ppm : float
     centre_mm : (x, y)
+    step_overlap_px, step_elsewhere_px : (N,) arrays
+        What is left of each step of the scanner, or was made where there is none, rms of its two coordinates: of the
+        parts' overlaps and between them.
     """
 
     seam_px: FloatArray
@@ -182,6 +185,8 @@ class Errors:
     parallel_um: float
     scale_ppm: float
     centre_mm: tuple[float, float]
+    step_overlap_px: FloatArray
+    step_elsewhere_px: FloatArray
 
 
 def errors(
@@ -192,13 +197,9 @@ def errors(
     places = [film.wishes.order["abcd".index(letter)] for letter in letters]
     laid = [Pose(*pose) for pose in zip(seams["turned"], seams["mirrored"], strict=True)]
 
-    def joined(k: int, delivered: FloatArray, *, steps: bool = True) -> FloatArray:
-        """Place in the joined film (x, y) of delivered film points, by the part at place k of the layout."""
+    def laid_pixels(k: int, rows_columns: FloatArray) -> FloatArray:
+        """Pixels (x, y) of the part at place k of the layout, as it lies there, of its pixels as it was digitised."""
         part = film.truth.parts[places[k]]
-        rows_columns = part.pixels(delivered)
-        for _ in range(4 if steps else 0):
-            off = part.delivered(rows_columns[..., 0], rows_columns[..., 1]) - delivered
-            rows_columns = rows_columns - (part.pixels(delivered + off) - part.pixels(delivered))
         xy = rows_columns[..., ::-1]
         for pose in (film.wishes.poses[places[k]], laid[k]):
             size = np.array([part.shape[1] - 1.0, part.shape[0] - 1.0])
@@ -206,7 +207,22 @@ def errors(
                 xy = np.stack([xy[..., 0], size[1] - xy[..., 1]], axis=-1)
             if pose.turned:
                 xy = size - xy
+        return xy
+
+    def joined(k: int, delivered: FloatArray, *, steps: bool = True) -> FloatArray:
+        """Place in the joined film (x, y) of delivered film points, by the part at place k of the layout."""
+        part = film.truth.parts[places[k]]
+        rows_columns = part.pixels(delivered)
+        for _ in range(4 if steps else 0):
+            off = part.delivered(rows_columns[..., 0], rows_columns[..., 1]) - delivered
+            rows_columns = rows_columns - (part.pixels(delivered + off) - part.pixels(delivered))
+        xy = laid_pixels(k, rows_columns)
         return layout.motions[k].apply(xy - layout.steps[k].at(xy[..., 0]))
+
+    def ends_of(k: int) -> float:
+        """Last column of the joined film that the part at place k reaches."""
+        rows, columns = film.truth.parts[places[k]].shape
+        return float(layout.motions[k].apply(np.array([columns - 1.0, rows / 2]))[0])
 
     seam_px = []
     for k in range(len(letters) - 1):
@@ -217,6 +233,31 @@ def errors(
         both = (there[..., 1] > 3) & (there[..., 1] < second.shape[1] - 4) & (there[..., 0] > 3)
         away = joined(k, points[both]) - joined(k + 1, points[both])
         seam_px.append(np.sqrt(np.mean(away**2)))
+
+    step_px: tuple[list[float], list[float]] = ([], [])  # elsewhere, in overlaps
+    for k, place in enumerate(places):
+        part = film.truth.parts[place]
+        middle = part.shape[0] / 2
+        columns = np.arange(part.shape[1], dtype=float)
+        off = part.pixels(part.delivered(middle, columns)) - np.stack(np.broadcast_arrays(middle, columns), axis=-1)
+        # Displacement of what a pixel shows, before and after the stages took out what they found.
+        shown = laid_pixels(k, np.stack(np.broadcast_arrays(middle, columns), axis=-1) + off)
+        here = laid_pixels(k, np.stack(np.broadcast_arrays(middle, columns), axis=-1))
+        left_over = here - layout.steps[k].at(here[:, 0]) - shown
+        true = np.flatnonzero(np.abs(np.diff(off, axis=0)).max(axis=1) > 1e-6)
+        made = [int(np.abs(here[:, 0] - column).argmin()) for column in layout.steps[k].columns_px]
+        reach = 12
+        for column in np.union1d(true, [m for m in made if not np.any(np.abs(true - m) <= reach)]).astype(int):
+            if not reach <= column < part.shape[1] - reach - 1:
+                continue
+            left = float(np.sqrt(np.mean((left_over[column + reach] - left_over[column - reach]) ** 2)))
+            x = float(layout.motions[k].apply(here[column])[0])
+            seen = any(
+                layout.motions[j].apply(np.array([0.0, middle]))[0] < x < ends_of(j)
+                for j in (k - 1, k + 1)
+                if 0 <= j < len(places)
+            )
+            step_px[seen].append(left)
 
     def straight(ideal: FloatArray) -> FloatArray:
         """Places on the straight film, mm, of ideal film points."""
@@ -244,4 +285,6 @@ def errors(
         float(1000 * abs(slope[0] - slope[1]) * 710),
         float(1e6 * scale),
         (float(centre[0]), float(centre[1])),
+        np.array(step_px[True]),
+        np.array(step_px[False]),
     )
