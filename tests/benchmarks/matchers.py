@@ -2,7 +2,7 @@
 
     python tests/benchmarks/matchers.py --make NEW_FOLDER [--pixel-um 56] [--matchers structural,sift,lightglue:xfeat]
     python tests/benchmarks/matchers.py --folder SITE [--reference relief]
-    python tests/benchmarks/matchers.py --folder SITE --reference-m 3 [--stretch-mm 40] [--reference-error-m 1]
+    python tests/benchmarks/matchers.py --folder SITE --reference-m 3 [--stretch-mm 40] [--reference-error-m 0.6]
     COSP_TEST_DATA=... python tests/benchmarks/matchers.py --real
 
 --make simulates a site in a new folder and takes it as far as placed films; --folder takes one that has come so far,
@@ -40,20 +40,22 @@ from cosp.errors import CospError  # noqa: E402
 from cosp.film.bending import Bending  # noqa: E402
 from cosp.film.exposure import Exposure  # noqa: E402
 from cosp.film.joining import Layout  # noqa: E402
+from cosp.imaging.windows import Window  # noqa: E402
 from cosp.io import rasters, records, tables  # noqa: E402
 from cosp.io.heights import ellipsoidal_heights  # noqa: E402
 from cosp.matching.footprint import Footprint  # noqa: E402
-from cosp.matching.ground import ground_pixel_m, lattice_rc, map_bounds  # noqa: E402
+from cosp.matching.ground import ground_pixel_m, grown, lattice_rc, map_bounds  # noqa: E402
 from cosp.matching.matchers import matcher_by_name  # noqa: E402
 from cosp.simulation.reference import make_reference_image  # noqa: E402
 from cosp.simulation.site import SiteSettings, plan_site  # noqa: E402
-from cosp.simulation.terrain import MODERN_EPOCH, Scenery, light_terrain, make_terrain  # noqa: E402
+from cosp.simulation.terrain import MODERN_EPOCH, light_terrain, make_terrain  # noqa: E402
 from cosp.simulation.truth import true_part_pixels  # noqa: E402
 from scripts.collect_gcps import collect_gcps  # noqa: E402
 from scripts.match_tiles import match_tiles  # noqa: E402
 
 MATCHERS = "structural,sift,lightglue:xfeat,lightglue:disk"
 RIGHT_PX = 3.0
+REFERENCE_ERROR_M = 3.0  # of the simulator's reference images, per axis
 SUN_ERROR_DEG = 12.0
 BANDS = (3, 4)
 
@@ -106,26 +108,29 @@ def make_reference(folder: Path, scene: str, target: Path, posting_m: float, err
     """A reference image of another posting, of what the middle of a film shows, as the simulator makes them."""
     settings, site = settings_of(folder)
     truth = records.read_json(folder / f"resources/simulated/{site}/truth/site.json")["settings"]
+    if truth["dem"] is None:
+        raise SystemExit(f"{site}: made-up terrain cannot be made in parts; a site on a real DEM is needed")
     plan = plan_site(SiteSettings(**{**truth, "reference_image_m": posting_m, "reference_image_error_m": error_m}))
-    dem = plan.settings.dem
-    heights = None if dem is None else ellipsoidal_heights(dem, plan.terrain_grid, plan.crs, plan.settings.dem_heights)
-    scenery = light_terrain(plan, make_terrain(plan, heights, threads=1), MODERN_EPOCH, threads=1)
     camera = records.read(folder / "results" / "scenes" / scene / "footprint.json", Footprint).camera
     middle = replace(camera, half_length_mm=stretch_mm / 2)
-    xmin, ymin, xmax, ymax = map_bounds(middle, plan.crs, (0.0, 3000.0))
-    rows, columns = plan.terrain_grid.pixels(np.array([[xmin, ymax], [xmax, ymin]])).astype(int)
-    inside = np.s_[rows[0] : rows[1], columns[0] : columns[1]]
-    part = replace(plan, terrain_grid=plan.terrain_grid.window(rows[0], rows[1], columns[0], columns[1]))
-    scenery = Scenery(*(np.ascontiguousarray(band[inside]) for band in (scenery.radiance, scenery.strength)))
-    rng = np.random.default_rng([plan.settings.seed, 42])
-    image, grid = make_reference_image(part, scenery, rng, threads=1)
-    rasters.write(target, image, grid=grid, crs=plan.crs, nodata=0)
+    # What casts shadows into it lies within some kilometres.
+    xmin, ymin, xmax, ymax = grown(map_bounds(middle, plan.crs, (0.0, 3000.0)), 5000.0)
+    rows, columns = plan.terrain_grid.pixels(np.array([[xmin, ymax], [xmax, ymin]]))
+    part = replace(plan, terrain_grid=plan.terrain_grid.window(*rows.astype(int), *columns.astype(int)))
+    dem = ellipsoidal_heights(truth["dem"], part.terrain_grid, plan.crs, truth["dem_heights"])
+    scenery = light_terrain(part, make_terrain(part, dem, threads=1), MODERN_EPOCH, threads=1)
+    image, grid = make_reference_image(part, scenery, np.random.default_rng([truth["seed"], 42]), threads=1)
+    inside = grid.pixels(np.array([[xmin + 5000.0, ymax - 5000.0], [xmax - 5000.0, ymin + 5000.0]]))
+    window = Window(*inside[0].astype(int), *inside[1].astype(int))
+    grid = grid.window(window.row0, window.row1, window.column0, window.column1)
+    rasters.write(target, image[window.slices], grid=grid, crs=plan.crs, nodata=0)
 
 
-def measure(folder: Path, scene: str, name: str, reference: str, target: Path) -> dict:
+def measure(folder: Path, scene: str, name: str, reference: str, reference_sigma_m: float, target: Path) -> dict:
     """One matcher on one film, with the scripts of the workflow; what came out, against the truth.
 
     reference : "image" of the site, "relief" of its DEM, or the path of another image
+    reference_sigma_m : what its places are said to be good for
     """
     settings, site = settings_of(folder)
     matcher, _, features = name.partition(":")
@@ -154,7 +159,8 @@ def measure(folder: Path, scene: str, name: str, reference: str, target: Path) -
         *common, paths["reference_image"], matches_path, scatteritem="1-of-1", **heights, **chosen, threads=1
     )  # fmt: skip
     taken = time.process_time() - began
-    collect(matches_path, results, paths, gcps_path, summary_path, heights, settings["collect_gcps"])
+    said = {**settings["collect_gcps"], "reference_sigma_m": reference_sigma_m}
+    collect(matches_path, results, paths, gcps_path, summary_path, heights, said)
 
     matches = tables.read(matches_path)
     posting_m = float(matches["posting_m"].iloc[0])
@@ -252,9 +258,9 @@ def main() -> int:
     parser.add_argument("--real", action="store_true", help="the real images instead of a site")
     parser.add_argument("--reference", default="image", help="image of the site, relief of its DEM, or an image file")
     parser.add_argument("--reference-m", type=float, help="make a reference image of this posting, of --stretch-mm")
-    parser.add_argument("--reference-error-m", type=float, default=1.0)
+    parser.add_argument("--reference-error-m", type=float, default=0.6, help="m, per axis")
     parser.add_argument("--stretch-mm", type=float, default=40.0, help="of the film about its middle")
-    parser.add_argument("--one", nargs=3, metavar=("SCENE", "MATCHER", "REFERENCE"), help=argparse.SUPPRESS)
+    parser.add_argument("--one", nargs=4, metavar=("SCENE", "MATCHER", "REFERENCE", "SIGMA"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     names = options.matchers.split(",")
     if options.real:
@@ -266,7 +272,7 @@ def main() -> int:
         return 0
     if options.one:
         with tempfile.TemporaryDirectory() as target:
-            print(json.dumps(measure(options.folder, *options.one, Path(target))))
+            print(json.dumps(measure(options.folder, *options.one[:3], float(options.one[3]), Path(target))))
         return 0
     if options.make:
         if options.make.exists():
@@ -279,9 +285,9 @@ def main() -> int:
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         for scene in scenes[: options.scenes]:
-            reference = options.reference
+            reference, sigma_m = options.reference, REFERENCE_ERROR_M
             if options.reference_m:
-                reference = f"{scratch}/{options.reference_m:g} m.tif"
+                reference, sigma_m = f"{scratch}/{options.reference_m:g} m.tif", options.reference_error_m
                 made = (options.reference_m, options.reference_error_m, options.stretch_mm)
                 make_reference(folder, scene, Path(reference), *made)
             for name in names:
