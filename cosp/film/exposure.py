@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_opening, gaussian_filter1d
+from scipy.ndimage import binary_opening, gaussian_filter1d, uniform_filter1d
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from cosp.errors import InputError
@@ -66,6 +66,12 @@ _TILT_LIMIT_DEG = 1.0
 LINE_MM = 0.55
 # Fewer bright columns than this are a scratch, a mark or the border of the scan.
 _PICTURE_MM = 8.0
+_LENGTH_SD = 0.0015  # of the format's length: shrinkage of the film
+_FAINT_MM = 1.5  # of film whose mean grey shows a faint end
+_EVEN_MM = 6.0  # of bare film before it
+_FAINT_SIGNIFICANCE = 6.0
+_LEAST_FAINT_GREY = 0.02
+_THIRD = 1.0 / 3.0
 _BARE_MM = 5.0  # of film beyond the format at least
 
 
@@ -269,6 +275,15 @@ def _short_sides(
     left, right = ends[0][0], ends[1][0]
     if all(seen):
         return left, right, seen, 0.3
+    faint = _faint_ends(upright, valid, step_mm, nominal)
+    if faint is not None:
+        # Where the end is plain to see as well it is known better.
+        near = 2.0 * _FAINT_MM / step_mm
+        left, right = (
+            end if sure and abs(end - dim) < near else dim
+            for end, dim, sure in zip((left, right), faint, seen, strict=True)
+        )
+        return left, right, (True, True), 1.0
     # The dark side of a picture that ends in the night looks like the end of the format. The format must hold the
     # picture that is seen, and lie on the film that was scanned.
     scanned = np.flatnonzero(valid.mean(axis=0) > 0.9)
@@ -280,15 +295,68 @@ def _short_sides(
     shown = scanned[binary_opening(bright, np.ones(max(2, round(_PICTURE_MM / step_mm)), bool))]
     earliest = max(shown[-1] - nominal if shown.size else 0.0, float(scanned[0]))
     latest = min(float(shown[0]) if shown.size else np.inf, scanned[-1] - nominal)
-    slack = tolerance * nominal
+    slack, sd = tolerance * nominal, _LENGTH_SD * nominal / 2
     if earliest > latest:  # something bright beside the film: it bounds nothing
         earliest, latest = -np.inf, np.inf
     spread = (latest - earliest) / np.sqrt(12.0) if np.isfinite(latest) else 0.0
     for k, place in enumerate((left, right - nominal)):
         if seen[k] and earliest - slack / 4 <= place <= latest + slack / 4:
-            return place, place + nominal, seen, float(max(slack / 4, spread))
+            return place, place + nominal, seen, float(np.hypot(sd, spread))
     middle = (earliest + latest) / 2 if np.isfinite(latest) else (left + right - nominal) / 2
     return middle, middle + nominal, (False, False), float(max(slack, spread))
+
+
+def _faint_ends(upright: ByteArray, valid: BoolArray, step_mm: float, nominal: float) -> tuple[float, float] | None:
+    """Columns of two ends the nominal length apart, each a step that may be less than a grey level; None without.
+
+    Even the night is not quite as dark as bare film, and over the whole width: bare film is even, and the mean over the
+    rows shows a tenth of a grey level.
+    """
+    scanned = np.flatnonzero(valid.mean(axis=0) > 0.9)
+    columns = slice(int(scanned[0]), int(scanned[-1]) + 1)
+    ordered = np.sort(upright[:, columns], axis=0)
+    fifth = len(ordered) // 5
+    # Marks and scratches take up some rows only.
+    grey = ordered[fifth : len(ordered) - fifth].mean(axis=0)
+    count = len(grey)
+    width, beside = (max(2, round(mm / step_mm)) for mm in (_FAINT_MM, _EVEN_MM))
+    total = np.r_[0.0, np.cumsum(grey)]
+    means = (total[width:] - total[:-width]) / width
+    rise = np.full(count, np.nan)  # from before column c to after it
+    rise[width : count - width + 1] = means[width:] - means[:-width]
+    with np.errstate(invalid="ignore"):
+        scatter = np.stack([_scatter_before(side, beside, 2 * width) for side in (rise, rise[::-1])])
+    significance = np.abs(rise) / np.maximum(np.stack([scatter[0], scatter[1][::-1]]), _LEAST_FAINT_GREY)
+    significance = np.nan_to_num(significance, nan=0.0)
+    worth = np.where(significance >= _FAINT_SIGNIFICANCE, np.log(np.maximum(significance, 1.0)), -np.inf)
+    slack = round(2.5 * _LENGTH_SD * nominal)
+    best = (-np.inf, 0, 0)
+    for distance in range(round(nominal) - slack, round(nominal) + slack + 1):
+        if distance < count:
+            both = worth[0, : count - distance] + worth[1, distance:]
+            both = both - 0.5 * ((distance - nominal) / (_LENGTH_SD * nominal)) ** 2
+            if both.max() > best[0]:
+                best = (float(both.max()), int(both.argmax()), int(both.argmax()) + distance)
+    if best[2] == 0:
+        return None
+    ends = []
+    for at, inwards in zip(best[1:], (1, -1), strict=True):
+        # From outside, where grey has gone a third of the way.
+        near = at + inwards * np.arange(-width, width + 1)
+        near = near[(near >= 0) & (near < count)]
+        outside, inside = np.median(grey[near[: width // 2]]), np.median(grey[near[-width // 2 :]])
+        passed = (uniform_filter1d(grey, 3)[near] - outside) / (inside - outside) > _THIRD
+        ends.append(float(near[int(passed.argmax())]) - inwards * 0.5)
+    return columns.start + ends[0], columns.start + ends[1]
+
+
+def _scatter_before(values: FloatArray, count: int, gap: int) -> FloatArray:
+    """Scatter about zero of the `count` values that end `gap` before each place; NaN where there are fewer."""
+    out = np.full(len(values), np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(np.abs(values), count)
+    scatter = 1.4826 * np.median(windows, axis=1)
+    out[count + gap - 1 :] = scatter[: len(values) - count - gap + 1]
+    return out
 
 
 def _refine_end(profile: FloatArray, column: float) -> tuple[float, float]:
