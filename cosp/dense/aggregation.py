@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -19,7 +18,7 @@ _log = logging.getLogger(__name__)
 LARGEST_PENALTY = 127 - kernels.CENSUS_BITS
 """Two path costs must add up within a byte."""
 
-_scratch = threading.local()
+_spare: list[ByteArray] = []
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class Winners:
 
     winners : (rows, columns) array
     costs : (rows, columns, 4) array, sums over the eight paths: at the lower neighbour, the winner, the upper neighbour
-        (65535 beyond the range), and the least of all the others
+        (65535 // disparities beyond the range), and the least of all the others
     right_winners : (rows, columns + disparities) array, cheapest index for each right pixel
     """
 
@@ -38,15 +37,20 @@ class Winners:
 
 
 def aggregate_costs(
-    left_planes: ByteArray, right_planes: ByteArray, *, disparities: int, small_step: int, large_step: int
+    left_planes: NDArray[np.uint16],
+    right_planes: NDArray[np.uint16],
+    *,
+    disparities: int,
+    small_step: int,
+    large_step: int,
 ) -> Winners:
     """Cheapest of the disparities -disparities / 2 … disparities / 2 - 1 at each pixel, after semi-global aggregation.
 
     Parameters
     ----------
-    left_planes : (8, rows, columns) array
+    left_planes : (4, rows, columns) array
         Census of the left picture.
-    right_planes : (8, rows, columns + 2 margin) array
+    right_planes : (4, rows, columns + 2 margin) array
         Census of the right picture, which goes on by at least disparities / 2 columns on both sides.
     disparities : int
         32 or 64 in vector form, any even number up to 256 in plain loops.
@@ -68,27 +72,37 @@ def aggregate_costs(
         np.empty((rows, columns, 4), np.uint16),
         np.empty((rows, columns + disparities), np.uint8),
     )
-    _passes(disparities)(
-        left_planes,
-        right_planes,
-        margin - disparities // 2,
-        small_step,
-        large_step,
-        _volume(rows, columns, disparities),
-        found.winners,
-        found.costs,
-        found.right_winners,
-    )
+    pixels = rows * columns
+    size = pixels * (2 * disparities + 4)
+    memory = _memory_of(size)
+    try:
+        _passes(disparities)(
+            left_planes,
+            right_planes,
+            margin - disparities // 2,
+            small_step,
+            large_step,
+            memory[4 * pixels : size].reshape(2, rows, columns, disparities),
+            memory[: 4 * pixels].view(np.uint32).reshape(rows, columns),
+            found.winners,
+            found.costs,
+            found.right_winners,
+        )
+    finally:
+        _spare.append(memory)
     return found
 
 
-def _volume(rows: int, columns: int, disparities: int) -> NDArray[np.uint16]:
-    """Memory of this thread for the sums: touching fresh memory takes longer than matching."""
-    size = rows * columns * disparities
-    if getattr(_scratch, "volume", None) is None or _scratch.volume.size < size:
-        _scratch.volume = np.empty(size, np.uint16)
-    volume: NDArray[np.uint16] = _scratch.volume[:size].reshape(rows, columns, disparities)
-    return volume
+def _memory_of(size: int) -> ByteArray:
+    """At least so many bytes, used before if possible: touching fresh memory takes as long as matching."""
+    try:
+        memory = _spare.pop()  # of one piece for each thread that ever matched; threads do not get the same one
+    except IndexError:
+        memory = np.empty(0, np.uint8)
+    if memory.size < size:
+        del memory  # before the next is asked for
+        memory = np.empty(size, np.uint8)
+    return memory
 
 
 @cache
@@ -97,8 +111,8 @@ def _passes(disparities: int) -> Callable[..., None]:
     if disparities not in (32, 64):
         return kernels.plain_passes
     passes = kernels.vector_passes(disparities)
-    planes = np.zeros((kernels.PLANES, 1, 1), np.uint8)
-    right_planes = np.zeros((kernels.PLANES, 1, 1 + disparities), np.uint8)
+    planes = np.zeros((kernels.PLANES, 1, 1), np.uint16)
+    right_planes = np.zeros((kernels.PLANES, 1, 1 + disparities), np.uint16)
     try:
         passes(
             planes,
@@ -106,7 +120,8 @@ def _passes(disparities: int) -> Callable[..., None]:
             0,
             1,
             1,
-            np.empty((1, 1, disparities), np.uint16),
+            np.empty((2, 1, 1, disparities), np.uint8),
+            np.empty((1, 1), np.uint32),
             np.empty((1, 1), np.uint8),
             np.empty((1, 1, 4), np.uint16),
             np.empty((1, 1 + disparities), np.uint8),

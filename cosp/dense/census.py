@@ -8,6 +8,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cosp.arrays import BoolArray, ByteArray
 from cosp.dense import kernels
@@ -15,8 +16,8 @@ from cosp.dense import kernels
 _log = logging.getLogger(__name__)
 
 
-def left_census(image: ByteArray) -> ByteArray:
-    """Census of the left picture, 7 x 9 neighbours in byte planes.
+def left_census(image: ByteArray) -> NDArray[np.uint16]:
+    """Census of the left picture, 7 x 9 neighbours in planes of words.
 
     Parameters
     ----------
@@ -26,8 +27,8 @@ def left_census(image: ByteArray) -> ByteArray:
 
     Returns
     -------
-    (8, rows, columns) array
-        Hamming distance between the eight bytes of two pixels is their matching cost, 0 to 62.
+    (4, rows, columns) array
+        Hamming distance between the four words of two pixels is their matching cost, 0 to 62.
 
     References
     ----------
@@ -36,7 +37,7 @@ def left_census(image: ByteArray) -> ByteArray:
     return _census(image, kernels.LEFT_BLANK)
 
 
-def right_census(image: ByteArray) -> ByteArray:
+def right_census(image: ByteArray) -> NDArray[np.uint16]:
     """Census of the right picture; see `left_census`."""
     return _census(image, kernels.RIGHT_BLANK)
 
@@ -49,8 +50,8 @@ def lacks_data(image: ByteArray) -> BoolArray:
     return np.asarray(least == 0)
 
 
-def _census(image: ByteArray, blank: int) -> ByteArray:
-    planes = np.empty((kernels.PLANES, *image.shape), np.uint8)
+def _census(image: ByteArray, blank: int) -> NDArray[np.uint16]:
+    planes = np.empty((kernels.PLANES, *image.shape), np.uint16)
     wide_enough = image.shape[1] >= kernels.CENSUS_BLOCK + kernels.CENSUS_COLUMNS - 1
     transform = _transform() if wide_enough else kernels.census_plain
     transform(image, planes)
@@ -61,11 +62,11 @@ def _census(image: ByteArray, blank: int) -> ByteArray:
 
 
 @cache
-def _transform() -> Callable[[ByteArray, ByteArray], None]:
+def _transform() -> Callable[[ByteArray, NDArray[np.uint16]], None]:
     """The vector form where this machine's compiler takes it, else the plain loops."""
     try:
         image = np.zeros((8, 64), np.uint8)
-        kernels.census_vector(image, np.empty((kernels.PLANES, 8, 64), np.uint8))
+        kernels.census_vector(image, np.empty((kernels.PLANES, 8, 64), np.uint16))
     except Exception as error:  # whatever the compiler stumbles over, the loops give the same bits
         _log.warning("vector form of the census does not compile here, plain loops are used: %s", error)
         return kernels.census_plain

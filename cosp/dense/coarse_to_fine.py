@@ -17,16 +17,17 @@ import cv2
 import numpy as np
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array
+from cosp.dense import kernels
 from cosp.dense.aggregation import aggregate_costs
 from cosp.dense.census import left_census, right_census
-from cosp.dense.resampling import SmoothField, fill_holes, picture_pyramid, prior_of, resample_right
+from cosp.dense.resampling import SmoothField, picture_pyramid, prior_of, resample_right
 from cosp.dense.selection import DisparityMap, select_disparities
-from cosp.dense.validity import Validity, ambiguous, correlation, doubly_claimed, no_data, picture_validity, speckles
+from cosp.dense.validity import Validity, correlation, doubly_claimed, no_data, picture_validity, speckles, uniqueness
 from cosp.imaging.windows import Window, tiles
 
 _log = logging.getLogger(__name__)
 
-TILE_PX = 1536
+TILE_PX = 2048
 HALO_PX = 48
 """What a tile sees of its neighbours."""
 
@@ -139,30 +140,84 @@ def match(
         raise ValueError(f"disparity range {low} to {high} px: the lowest must be less than the highest")
     if left.shape[0] != right.shape[0]:
         raise ValueError(f"pictures of {left.shape[0]} and {right.shape[0]} rows: the same number is needed")
+    cv2.setNumThreads(1)
+    with ThreadPoolExecutor(threads) as pool:
+        last = _coarse_to_fine(
+            left,
+            right,
+            disparity_range_px,
+            y_parallax or _NO_FIELD,
+            small_step=small_step,
+            large_step=large_step,
+            tile_px=tile_px,
+            pool=pool,
+        )
+        result = DisparityMap(np.empty(left.shape, np.float32), *(np.empty(left.shape, np.uint8) for _ in range(3)))
+
+        def finish(window: Window) -> None:
+            grown = window.grown(HALO_PX, left.shape)
+            tile = _cleaned(
+                last,
+                grown,
+                _matched(last, grown, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
+                least_correlation=least_correlation,
+                least_uniqueness=least_uniqueness,
+                largest_speckle_px=largest_speckle_px,
+                speckle_step_px=speckle_step_px,
+            )
+            inside = window.inside(grown).slices
+            result.disparity[window.slices] = tile.disparity[inside]
+            result.validity[window.slices] = tile.validity[inside]
+            result.confidence[window.slices] = tile.confidence[inside]
+            result.similarity[window.slices] = tile.similarity[inside]
+
+        _log.info("level 0: %d disparities", last.step.disparities)
+        _over_tiles(finish, left.shape, tile_px, pool)
+        _settle_claims(
+            result,
+            right.shape[1],
+            largest_speckle_px=largest_speckle_px,
+            speckle_step_px=speckle_step_px,
+            pool=pool,
+        )
+    return result
+
+
+def _coarse_to_fine(
+    left: ByteArray,
+    right: ByteArray,
+    range_px: tuple[float, float],
+    y_parallax: SmoothField,
+    *,
+    small_step: int,
+    large_step: int,
+    tile_px: int,
+    pool: ThreadPoolExecutor,
+) -> _Task:
+    """All passes but the last, which is returned as the task that it is."""
+    low, high = range_px
     passes = plan_passes(high - low)
     levels = passes[0].level
     lefts = picture_pyramid(np.ascontiguousarray(left), levels)
     rights = picture_pyramid(np.ascontiguousarray(right), levels)
     found: Float32Array | None = None
     level = levels
-
-    def task_of(step: Pass) -> _Task:
-        return _Task(
+    for step in passes:
+        task = _Task(
             step,
             lefts[step.level],
             rights[step.level],
             found,
             level,
             (low / 2**step.level, high / 2**step.level),
-            y_parallax or _NO_FIELD,
+            y_parallax,
             # Before the first resampling slopes are not flat yet.
             small_step if found is not None else max(small_step // 2, 1),
             large_step,
         )
-
-    for step in passes[:-1]:
+        if step is passes[-1]:
+            break
         coarse = np.empty(lefts[step.level].shape, np.float32)
-        task = task_of(step)
 
         def keep(window: Window, task: _Task = task, coarse: Float32Array = coarse) -> None:
             grown = window.grown(HALO_PX, coarse.shape)
@@ -171,71 +226,59 @@ def match(
         _log.info("level %d: %d disparities", step.level, step.disparities)
         # The volume of a tile stays the same.
         size = tile_px if step.disparities == LEFT_OVER else 2 * tile_px // 3
-        _over_tiles(keep, coarse.shape, size, threads)
+        _over_tiles(keep, coarse.shape, size, pool)
         found, level = coarse, step.level
+    return task
 
-    result = DisparityMap(np.empty(left.shape, np.float32), *(np.empty(left.shape, np.uint8) for _ in range(3)))
-    last = task_of(passes[-1])
 
-    def finish(window: Window) -> None:
-        grown = window.grown(HALO_PX, left.shape)
-        tile = _cleaned(
-            last,
-            grown,
-            _matched(last, grown, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
-            least_correlation=least_correlation,
-            least_uniqueness=least_uniqueness,
-            largest_speckle_px=largest_speckle_px,
-            speckle_step_px=speckle_step_px,
-        )
-        inside = window.inside(grown).slices
-        result.disparity[window.slices] = tile.disparity[inside]
-        result.validity[window.slices] = tile.validity[inside]
-        result.confidence[window.slices] = tile.confidence[inside]
-        result.similarity[window.slices] = tile.similarity[inside]
-
-    _log.info("level 0: %d disparities", passes[-1].disparities)
-    _over_tiles(finish, left.shape, tile_px, threads)
-    # Of whole rows, since the two that claim a pixel may lie tiles apart.
-    claimed = np.empty(left.shape, np.bool_)
+def _settle_claims(
+    result: DisparityMap,
+    right_columns: int,
+    *,
+    largest_speckle_px: int,
+    speckle_step_px: float,
+    pool: ThreadPoolExecutor,
+) -> None:
+    """Take out the worse of two matches with the same right pixel, and the islands that this leaves, in place."""
+    shape = result.disparity.shape
+    claimed, left_over = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    bands = (BAND_ROWS, shape[1])  # whole rows, since the two may lie tiles apart
 
     def claim(window: Window) -> None:
-        band = window.grown(HALO_PX, left.shape)
-        lost = doubly_claimed(result.disparity[band.slices], result.confidence[band.slices], right.shape[1])
-        claimed[window.slices] = lost[window.inside(band).slices]
+        band = window.grown(HALO_PX, shape)
+        lost = doubly_claimed(result.disparity[band.slices], result.confidence[band.slices], right_columns)
+        if lost.any():
+            claimed[window.slices] = lost[window.inside(band).slices]
 
-    _over_tiles(claim, left.shape, (BAND_ROWS, left.shape[1]), threads)
-    _mask(result, claimed, Validity.INCONSISTENT)
-    if claimed.any():
-        left_over = np.empty(left.shape, np.bool_)
-
-        def clear(window: Window) -> None:
-            grown = window.grown(HALO_PX, left.shape)
+    def clear(window: Window) -> None:
+        grown = window.grown(HALO_PX, shape)
+        if claimed[grown.slices].any():
             islands = speckles(
                 result.disparity[grown.slices], largest_speckle_px=largest_speckle_px, speckle_step_px=speckle_step_px
             )
             left_over[window.slices] = islands[window.inside(grown).slices]
 
-        _over_tiles(clear, left.shape, tile_px, threads)
-        _mask(result, left_over, Validity.SPECKLE)
-    return result
+    # Nothing is taken out before all have looked at their surroundings.
+    _over_tiles(claim, shape, bands, pool)
+    _over_tiles(lambda window: _take_out(result, claimed, window, Validity.INCONSISTENT), shape, bands, pool)
+    _over_tiles(clear, shape, BAND_ROWS, pool)
+    _over_tiles(lambda window: _take_out(result, left_over, window, Validity.SPECKLE), shape, bands, pool)
 
 
-def _mask(result: DisparityMap, where: BoolArray, reason: Validity) -> None:
-    """Take disparities out of a result, in place."""
-    result.disparity[where] = np.nan
-    result.validity[where] |= np.uint8(reason)
+def _take_out(result: DisparityMap, where: BoolArray, window: Window, reason: Validity) -> None:
+    """Mask pixels of a result within a window, in place."""
+    chosen = where[window.slices]
+    if chosen.any():
+        kernels.take_out(chosen, int(reason), result.disparity[window.slices], result.validity[window.slices])
 
 
 def _over_tiles(
-    work: Callable[[Window], None], shape: tuple[int, ...], size: int | tuple[int, int], threads: int
+    work: Callable[[Window], None], shape: tuple[int, ...], size: int | tuple[int, int], pool: ThreadPoolExecutor
 ) -> None:
     """Do the work of every tile, so many at once; each writes to its own part of the result."""
     windows = tiles((shape[0], shape[1]), size)
-    cv2.setNumThreads(1)
-    with ThreadPoolExecutor(threads) as pool:
-        for done, _ in enumerate(pool.map(work, windows), start=1):
-            _log.debug("tile %d/%d", done, len(windows))
+    for done, _ in enumerate(pool.map(work, windows), start=1):
+        _log.debug("tile %d/%d", done, len(windows))
 
 
 def _matched(
@@ -275,10 +318,14 @@ def _matched(
         small_step=task.small_step,
         large_step=task.large_step,
     )
-    result = select_disparities(found, prior, left_validity=left_validity, right_validity=right_validity)
-    doubtful = result.validity if least_texture_sd is not None else result.validity & ~np.uint8(Validity.AT_RANGE_EDGE)
-    result.disparity[doubtful != 0] = np.nan
-    return result
+    return select_disparities(
+        found,
+        prior,
+        left_validity=left_validity,
+        right_validity=right_validity,
+        tolerated=0 if least_texture_sd is not None else int(Validity.AT_RANGE_EDGE),
+        whole=least_texture_sd is not None,
+    )
 
 
 def _cleaned(
@@ -292,30 +339,29 @@ def _cleaned(
     speckle_step_px: float,
 ) -> DisparityMap:
     """Median of 5 x 5; what is not alike, what does not stand out and islands masked; disparities rounded."""
-    given = tile.validity == 0
-    if not given.any():
+    if tile.validity.all():
         return tile
-    disparity = np.asarray(cv2.medianBlur(fill_holes(tile.disparity), 5), np.float32)
+    disparity = np.asarray(cv2.medianBlur(tile.disparity, 5), np.float32)
     right = resample_right(
         task.right, disparity, window.row0, window.column0, y_parallax=task.y_parallax, level=task.step.level
     )
-    alike = correlation(task.left[window.slices], right)
-    unlike = given & (alike < least_correlation)
-    doubtful = given & ambiguous(tile.confidence, least_uniqueness)
-    disparity[~given | unlike | doubtful] = np.nan
+    kernels.clean(
+        disparity,
+        correlation(np.ascontiguousarray(task.left[window.slices]), right),
+        uniqueness(tile.confidence),
+        least_correlation,
+        255 * least_uniqueness,
+        int(Validity.LOW_CORRELATION),
+        int(Validity.INCONSISTENT),
+        tile.validity,
+        tile.similarity,
+    )
     islands = speckles(disparity, largest_speckle_px=largest_speckle_px, speckle_step_px=speckle_step_px)
-    disparity[islands] = np.nan
-    np.rint(disparity * FRACTIONS, out=disparity)
+    kernels.take_out(islands, int(Validity.SPECKLE), disparity, tile.validity)
+    disparity *= FRACTIONS
+    np.rint(disparity, out=disparity)
     disparity /= FRACTIONS
-    validity = tile.validity
-    for where, bit in (
-        (islands, Validity.SPECKLE),
-        (unlike, Validity.LOW_CORRELATION),
-        (doubtful, Validity.INCONSISTENT),
-    ):
-        validity |= where.view(np.uint8) * np.uint8(bit)
-    similarity = (255 * np.clip(alike, 0, 1)).astype(np.uint8)
-    return DisparityMap(disparity, validity, tile.confidence, similarity)
+    return DisparityMap(disparity, tile.validity, tile.confidence, tile.similarity)
 
 
 def strip_alignment_px(span_px: float) -> int:

@@ -1,12 +1,14 @@
 """Compiled loops of dense matching, the only module of the package that needs a compiler.
 
-Two of them, the census transform and the semi-global passes, exist twice: in vector form, where the work of one pixel
-is an `@intrinsic` that emits LLVM vector code over all its disparities, and as plain loops that say the same readably.
-Both give the same bits. LLVM lowers the vector form to whatever the machine has, from SSE2 to AVX-512 and NEON.
+Three of them, the census transform, the semi-global passes and the resampling, exist twice: in vector form, an
+`@intrinsic` that emits LLVM vector code over many pixels or disparities at once, and as plain loops that say the same
+readably. Both give the same bits. LLVM lowers the vector form to whatever the machine has, from SSE2 to AVX-512 and NEON.
 
 How the semi-global passes stay quick: path costs are bytes, brought to minimum zero at every pixel, so that a path
-never exceeds `large_step` + 62 and two of them add up within a byte; two sweeps of four paths each share one volume of
-sums; the second sweep also finds the winner, the runner-up and the best match as the right picture sees it.
+never exceeds `large_step` + 62 and two of them add up within a byte. The first of two sweeps of four paths each leaves
+the costs and its sums, as bytes above their least. The second finds winner, runner-up and the best match as the right
+picture sees it, by words that hold cost and disparity, so that one minimum gives both. A row is one loop of vector
+code, which keeps the path along the row and the right picture's best in registers.
 
 Numba's cache does not notice changes in other modules, so everything a kernel calls stands in this file.
 
@@ -28,18 +30,21 @@ from numba.extending import intrinsic
 
 CENSUS_ROWS, CENSUS_COLUMNS = 7, 9
 CENSUS_BITS = CENSUS_ROWS * CENSUS_COLUMNS - 1
-PLANES = 8  # bytes that hold the bits
-CENSUS_BLOCK = 32  # pixels that the vector census takes at once
+PLANES = 4  # words of 16 bits that hold the bits
+CENSUS_BLOCK = 64  # pixels that the vector census takes at once
+SAMPLE_BLOCK = 16  # pixels that the vector resampling takes at once
+RIM = 4  # zeros around a picture that is resampled: what is read at once reaches so far
 HALF_ROWS, HALF_COLUMNS = CENSUS_ROWS // 2, CENSUS_COLUMNS // 2
 CENTRE = HALF_ROWS * CENSUS_COLUMNS + HALF_COLUMNS
 
 # No data looks equally unlike everything, itself in the other picture included: these two patterns differ in half their
 # bits from each other and, on average, from any census.
-LEFT_BLANK, RIGHT_BLANK = 0x55, 0x33
+LEFT_BLANK, RIGHT_BLANK = 0x5555, 0x3333
 
 BELOW, BEST, ABOVE, RUNNER_UP = 0, 1, 2, 3  # layers of the costs that the passes leave for each pixel
 UNKNOWN_COST = 65535
 
+_REGISTER = 64  # bytes of the vectors in which paths are carried
 _I8, _I16, _I32, _I64 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64)
 
 
@@ -94,116 +99,262 @@ def _permuted(builder: Any, a: Any, b: Any, lanes: Sequence[int]) -> Any:
 
 
 def _emit_costs(builder: Any, count: int, left: Any, left_plane: Any, right: Any, right_plane: Any) -> Any:
-    """Hamming distances between one left pixel and `count` neighbouring right pixels."""
-    lanes = _Lanes(builder, count, 8)
+    """Hamming distances between one left pixel, its words doubled, and `count` neighbouring right pixels."""
+    lanes, pairs = _Lanes(builder, count, 16), _Lanes(builder, count // 2, 32)
     total = None
     for plane in range(PLANES):
         address = builder.add(left, builder.mul(left_plane, _I64(plane)))
-        code = lanes.splat(builder.load(builder.inttoptr(address, _I8.as_pointer())))
+        code = builder.load(builder.inttoptr(address, _I32.as_pointer()), align=4)
         codes = lanes.load(builder.add(right, builder.mul(right_plane, _I64(plane))))
-        distances = lanes.bits_set(builder.xor(code, codes))
+        distances = lanes.bits_set(builder.xor(builder.bitcast(pairs.splat(code), lanes.type), codes))
         total = distances if total is None else builder.add(total, distances)
-    return total
+    return builder.trunc(total, ir.VectorType(_I8, count))
 
 
-def _emit_paths(
-    builder: Any, count: int, costs: Any, beside: Any, before: Sequence[Any], after: Any, small: Any, large: Any
-) -> Any:
-    """Carry four paths over one pixel, packed in one vector; returns their sum in 16 bits."""
-    one, four, wide = _Lanes(builder, count, 8), _Lanes(builder, 4 * count, 8), _Lanes(builder, count, 16)
-    total = 4 * count
-    paths = [one.load(address) for address in (beside, *before)]
-    pairs = [_permuted(builder, paths[i], paths[i + 1], range(2 * count)) for i in (0, 2)]
-    packed = _permuted(builder, pairs[0], pairs[1], range(total))
-    wall = four.constant(255)
-    lower = _permuted(builder, packed, wall, [total if i % count == 0 else i - 1 for i in range(total)])
-    upper = _permuted(builder, packed, wall, [total if i % count == count - 1 else i + 1 for i in range(total)])
-    stepped = four.saturating_sum(four.lesser(lower, upper), four.splat(small))
-    reached = four.lesser(four.lesser(packed, four.splat(large)), stepped)
-    carried = builder.add(reached, _permuted(builder, costs, costs, list(range(count)) * 4))
-    least, turn = carried, count // 2
-    while turn:  # the minimum of each path ends up in all of its lanes
-        turned = [(i // count) * count + (i % count + turn) % count for i in range(total)]
-        least = four.lesser(least, _permuted(builder, least, least, turned))
-        turn //= 2
-    normalised = builder.sub(carried, least)
-    targets = [beside, *(builder.add(after, _I64(i * count)) for i in range(3))]
-    for i, address in enumerate(targets):
-        one.store(_permuted(builder, normalised, normalised, range(i * count, (i + 1) * count)), address)
-    halves = [_permuted(builder, carried, carried, range(i * 2 * count, (i + 1) * 2 * count)) for i in (0, 1)]
-    summed = builder.add(*halves)  # at most 2 (large + 62) <= 254
-    quarters = [_permuted(builder, summed, summed, range(i * count, (i + 1) * count)) for i in (0, 1)]
-    return builder.add(*(builder.zext(quarter, wide.type) for quarter in quarters))
+def _emit_least(builder: Any, count: int, paths: Sequence[Any]) -> tuple[Any, list[Any]]:
+    """Least value of each of four paths: in the four quarters of one vector, and spread like the paths."""
+    lanes = _Lanes(builder, _REGISTER, 8)
+    half = _REGISTER // 2
+    if count == _REGISTER:
+        paths = [
+            lanes.lesser(
+                _permuted(builder, a, b, [*range(half), *range(2 * half, 3 * half)]),
+                _permuted(builder, a, b, [*range(half, 2 * half), *range(3 * half, 4 * half)]),
+            )
+            for a, b in (paths[:2], paths[2:])
+        ]
+    folded = [
+        _permuted(builder, *paths, [32 * path + 16 * part + i for path in range(4) for i in range(16)])
+        for part in range(2)
+    ]
+    least = lanes.lesser(*folded)
+    least = lanes.lesser(least, _permuted(builder, least, least, [i ^ 8 for i in range(_REGISTER)]))
+    for width, places in ((64, 32), (32, 16), (32, 8)):  # turning words is cheaper than moving bytes
+        least = lanes.lesser(least, builder.bitcast(_turned(builder, least, width, places), lanes.type))
+    quarters = [[path] * (count // 16) for path in range(4)]
+    order = [quarter for path in quarters for quarter in path]
+    lanes_of = [[16 * quarter + i for i in range(16)] for quarter in order]
+    per_vector = _REGISTER // 16
+    spread = [
+        _permuted(builder, least, least, sum(lanes_of[start : start + per_vector], []))
+        for start in range(0, len(order), per_vector)
+    ]
+    return least, spread
+
+
+def _turned(builder: Any, vector: Any, width: int, places: int) -> Any:
+    """The words of `width` bits of a vector, each turned left."""
+    words = _Lanes(builder, 8 * _REGISTER // width, width)
+    signature = ir.FunctionType(words.type, [words.type] * 3)
+    turn = cgutils.get_or_insert_function(builder.module, signature, f"llvm.fshl.v{words.count}i{width}")
+    whole = builder.bitcast(vector, words.type)
+    return builder.call(turn, [whole, whole, words.constant(places)])
+
+
+def _emit_paths(builder: Any, count: int, paths: Sequence[Any], costs: Any, small: Any, large: Any) -> list[Any]:
+    """Carry four paths over one pixel; `costs` and paths lie in vectors of _REGISTER bytes."""
+    lanes = _Lanes(builder, _REGISTER, 8)
+    places = range(_REGISTER)
+    carried = []
+    for path in paths:
+        # At either end of the range a disparity is its own neighbour, a step from which never pays.
+        lower = _permuted(builder, path, path, [i if i % count == 0 else i - 1 for i in places])
+        upper = _permuted(builder, path, path, [i if i % count == count - 1 else i + 1 for i in places])
+        beside = lanes.lesser(lower, upper)
+        stepped = lanes.saturating_sum(beside, lanes.splat(small))
+        carried.append(builder.add(lanes.lesser(lanes.lesser(path, lanes.splat(large)), stepped), costs))
+    return carried
+
+
+def _emit_row(
+    builder: Any, count: int, columns: Any, states: Any, down: bool, small: Any, large: Any, pixel: Any
+) -> None:
+    """Loop over a row, carrying four paths: beside, kept in registers, and three from the row before.
+
+    `states` is the address of slots of four paths for each column and one more at both ends. A slot holds what the row
+    before sends to its pixel: the state is put into the slot of the pixel that it goes to. pixel(column) gives the
+    costs and takes carried, normalised and least.
+    """
+    lanes = _Lanes(builder, _REGISTER, 8)
+    half = _REGISTER // 2
+    vectors = 4 * count // _REGISTER
+    step = 1 if down else -1
+    waiting = cgutils.alloca_once_value(builder, lanes.constant(0))  # goes into the next slot once that is read
+    beside = cgutils.alloca_once_value(builder, lanes.constant(0))  # the last vector of the pixel before
+    with cgutils.for_range(builder, columns) as loop:
+        column = loop.index if down else builder.sub(builder.sub(columns, _I64(1)), loop.index)
+        slot = builder.add(states, builder.mul(builder.add(column, _I64(1)), _I64(4 * count)))
+        paths = [lanes.load(builder.add(slot, _I64(i * _REGISTER))) for i in range(vectors - 1)]
+        if count == _REGISTER:
+            paths.append(builder.load(beside))
+        else:
+            third = _Lanes(builder, half, 8).load(builder.add(slot, _I64(_REGISTER)))
+            third = _permuted(builder, third, third, range(_REGISTER))
+            paths.append(_permuted(builder, third, builder.load(beside), [*range(half), *range(3 * half, 4 * half)]))
+        costs, finish = pixel(column)
+        carried = _emit_paths(builder, count, paths, costs, small, large)
+        least, spread = _emit_least(builder, count, carried)
+        normalised = [builder.sub(a, b) for a, b in zip(carried, spread, strict=True)]
+        one = _Lanes(builder, count, 8)
+
+        def path(vectors: Sequence[Any], i: int) -> Any:
+            at = i * count
+            vector = vectors[at // _REGISTER]
+            return _permuted(builder, vector, vector, range(at % _REGISTER, at % _REGISTER + count))
+
+        one.store(path([builder.load(waiting)], 0), slot)
+        builder.store(normalised[0], waiting)
+        one.store(path(normalised, 1), builder.add(slot, _I64(count)))
+        one.store(path(normalised, 2), builder.add(slot, _I64(2 * count - step * 4 * count)))
+        builder.store(normalised[-1], beside)
+        finish(carried, normalised, least)
+
+
+def _halves(builder: Any, vector: Any) -> tuple[Any, Any]:
+    half = _REGISTER // 2
+    return _permuted(builder, vector, vector, range(half)), _permuted(builder, vector, vector, range(half, 2 * half))
 
 
 @intrinsic(prefer_literal=True)
-def _carry_paths(
+def _sweep_down(
     _context: Any,
     count: Any,
+    columns: Any,
     left: Any,
     left_plane: Any,
     right: Any,
     right_plane: Any,
-    beside: Any,
-    before_0: Any,
-    before_1: Any,
-    before_2: Any,
-    after: Any,
+    states: Any,
+    costs: Any,
     sums: Any,
+    leasts: Any,
     small: Any,
     large: Any,
 ) -> Any:
-    """Carry four paths over one pixel; their sum goes to `sums`. All but the steps are addresses."""
+    """One row of the first sweep: costs, sums of the four paths above their least, and the sum of the four leasts.
+
+    All but the numbers of disparities and columns and the steps are addresses, or bytes from plane to plane.
+    """
     disparities = count.literal_value
-    signature = types.void(count, *([types.int64] * 10), types.uint8, types.uint8)
+    signature = types.void(count, *([types.int64] * 9), types.uint8, types.uint8)
 
     def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        _, left, left_plane, right, right_plane, beside, b0, b1, b2, after, sums, small, large = arguments
-        costs = _emit_costs(builder, disparities, left, left_plane, right, right_plane)
-        total = _emit_paths(builder, disparities, costs, beside, (b0, b1, b2), after, small, large)
-        _Lanes(builder, disparities, 16).store(total, sums)
+        _, columns, left, left_plane, right, right_plane, states, costs, sums, leasts, small, large = arguments
+        one = _Lanes(builder, disparities, 8)
+
+        def pixel(column: Any) -> Any:
+            cost = _emit_costs(
+                builder,
+                disparities,
+                builder.add(left, builder.mul(column, _I64(4))),
+                left_plane,
+                builder.add(right, builder.mul(column, _I64(2))),
+                right_plane,
+            )
+            at = builder.mul(column, _I64(disparities))
+            one.store(cost, builder.add(costs, at))
+            repeated = _permuted(builder, cost, cost, [i % disparities for i in range(_REGISTER)])
+
+            def finish(_carried: Any, normalised: Any, least: Any) -> None:
+                if disparities == _REGISTER:
+                    parts = builder.add(normalised[0], normalised[1]), builder.add(normalised[2], normalised[3])
+                else:
+                    parts = _halves(builder, builder.add(*normalised))
+                one.store(one.saturating_sum(*parts), builder.add(sums, at))
+                four = builder.bitcast(_permuted(builder, least, least, [0, 16, 32, 48]), _I32)
+                even = builder.and_(four, _I32(0x00FF00FF))
+                odd = builder.and_(builder.lshr(four, _I32(8)), _I32(0x00FF00FF))
+                pairs = builder.add(even, odd)
+                both = builder.add(pairs, builder.or_(builder.lshr(pairs, _I32(16)), builder.shl(pairs, _I32(16))))
+                address = builder.add(leasts, builder.mul(column, _I64(4)))
+                builder.store(both, builder.inttoptr(address, _I32.as_pointer()), align=4)
+
+            return repeated, finish
+
+        _emit_row(builder, disparities, columns, states, True, small, large, pixel)
         return context.get_dummy_value()
 
     return signature, generate
 
 
 @intrinsic(prefer_literal=True)
-def _choose(
+def _sweep_up(
     _context: Any,
     count: Any,
-    forward: Any,
-    backward: Any,
+    columns: Any,
+    states: Any,
+    costs: Any,
+    sums: Any,
+    leasts: Any,
     masks: Any,
-    right_costs: Any,
-    right_indices: Any,
+    keys: Any,
+    right_keys: Any,
+    winners: Any,
+    found: Any,
+    small: Any,
+    large: Any,
 ) -> Any:
-    """Winner + 65536 * cost of the runner-up at one pixel, whose `backward` sums become those of all eight paths.
+    """One row of the second sweep: winners, their costs and those around them, keys of the right pixels.
 
-    Lowers the costs of the right pixels that it could be matched with.
+    A key is a cost times the number of disparities, plus the disparity: the least key tells both.
     """
     disparities = count.literal_value
-    signature = types.int64(count, *([types.int64] * 5))
+    bits = disparities.bit_length() - 1
+    signature = types.void(count, *([types.int64] * 10), types.uint8, types.uint8)
 
-    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        _, forward, backward, masks, right_costs, right_indices = arguments
-        lanes = _Lanes(builder, disparities, 16)
-        total = builder.add(lanes.load(forward), lanes.load(backward))
-        lanes.store(total, backward)
-        is_least = builder.icmp_unsigned("==", total, lanes.splat(lanes.least(total)))
-        bits = ir.IntType(disparities)
-        first_set = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(bits, [bits, ir.IntType(1)]), f"llvm.cttz.i{disparities}"
-        )
-        winner = builder.call(first_set, [builder.bitcast(is_least, bits), ir.IntType(1)(1)])
-        if disparities < 64:
-            winner = builder.zext(winner, _I64)
-        mask = lanes.load(builder.add(masks, builder.mul(_I64(2), builder.sub(_I64(disparities), winner))))
-        runner_up = builder.zext(lanes.least(builder.or_(total, mask)), _I64)
-        old_costs, old_indices = lanes.load(right_costs), lanes.load(right_indices)
-        is_lower = builder.icmp_unsigned("<", total, old_costs)
-        lanes.store(lanes.lesser(total, old_costs), right_costs)
-        lanes.store(builder.select(is_lower, lanes.constant(range(disparities)), old_indices), right_indices)
-        return builder.or_(winner, builder.shl(runner_up, _I64(16)))
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        _, columns, states, costs, sums, leasts, masks, keys, right_keys, winners, found, small, large = arguments
+        one, wide = _Lanes(builder, disparities, 8), _Lanes(builder, disparities, 16)
+        pairs = _Lanes(builder, disparities // 2, 32)
+        best_right = cgutils.alloca_once_value(builder, wide.constant(UNKNOWN_COST))
+
+        def pixel(column: Any) -> Any:
+            at = builder.mul(column, _I64(disparities))
+            cost = one.load(builder.add(costs, at))
+            repeated = _permuted(builder, cost, cost, [i % disparities for i in range(_REGISTER)])
+
+            def finish(carried: Any, _normalised: Any, _least: Any) -> None:
+                if disparities == _REGISTER:
+                    parts = builder.add(carried[0], carried[1]), builder.add(carried[2], carried[3])
+                else:
+                    parts = _halves(builder, builder.add(*carried))  # at most 2 (large + 62) <= 254
+                total = builder.add(*(builder.zext(part, wide.type) for part in parts))
+                total = builder.add(total, builder.zext(one.load(builder.add(sums, at)), wide.type))
+                address = builder.add(leasts, builder.mul(column, _I64(4)))
+                both = builder.load(builder.inttoptr(address, _I32.as_pointer()), align=4)
+                total = builder.add(total, builder.bitcast(pairs.splat(both), wide.type))
+                key = builder.or_(builder.shl(total, wide.constant(bits)), wide.constant(range(disparities)))
+                wide.store(key, keys)
+                lowest = builder.zext(wide.least(key), _I64)
+                winner = builder.and_(lowest, _I64(disparities - 1))
+                mask = wide.load(builder.add(masks, builder.mul(_I64(2), builder.sub(_I64(disparities), winner))))
+                runner_up = builder.zext(wide.least(builder.or_(key, mask)), _I64)
+
+                shifted = builder.load(best_right)
+                shifted = _permuted(builder, shifted, shifted, [max(i - 1, 0) for i in range(disparities)])
+                fresh = wide.constant([UNKNOWN_COST] + [0] * (disparities - 1))
+                best = wide.lesser(builder.or_(shifted, fresh), key)
+                builder.store(best, best_right)
+                wide.store(best, builder.add(right_keys, builder.mul(column, _I64(2))))
+
+                address = builder.add(winners, column)
+                builder.store(builder.trunc(winner, _I8), builder.inttoptr(address, _I8.as_pointer()))
+                place = builder.add(keys, builder.mul(winner, _I64(2)))
+                addresses = [builder.add(place, _I64(2 * i)) for i in (-1, 1)]
+                words = [builder.load(builder.inttoptr(a, _I16.as_pointer()), align=2) for a in addresses]
+                around = [builder.zext(word, _I64) for word in words]
+                packed = builder.lshr(lowest, _I64(bits))
+                packed = builder.shl(packed, _I64(16 * BEST))
+                for value, layer in ((around[0], BELOW), (around[1], ABOVE), (runner_up, RUNNER_UP)):
+                    value = builder.lshr(value, _I64(bits))
+                    packed = builder.or_(packed, builder.shl(value, _I64(16 * layer)))
+                address = builder.add(found, builder.mul(column, _I64(8)))
+                builder.store(packed, builder.inttoptr(address, _I64.as_pointer()), align=2)
+
+            return repeated, finish
+
+        _emit_row(builder, disparities, columns, states, False, small, large, pixel)
+        return context.get_dummy_value()
 
     return signature, generate
 
@@ -224,12 +375,53 @@ def _census_block(_context: Any, source: Any, source_row: Any, target: Any, targ
 
         centre = pixels(CENTRE)
         places = [place for place in range(CENSUS_BITS + 1) if place != CENTRE]
+        wide = _Lanes(builder, CENSUS_BLOCK, 16)
         for plane in range(PLANES):
-            code = lanes.constant(0)
-            for bit, place in enumerate(places[8 * plane : 8 * plane + 8]):
-                darker = builder.sext(builder.icmp_unsigned("<", pixels(place), centre), lanes.type)
-                code = builder.or_(code, builder.and_(darker, lanes.constant(1 << bit)))
-            lanes.store(code, builder.add(target, builder.mul(target_plane, _I64(plane))))
+            word = wide.constant(0)
+            for part in range(2):
+                code = lanes.constant(0)
+                first = 16 * plane + 8 * part
+                for bit, place in enumerate(places[first : first + 8]):
+                    darker = builder.sext(builder.icmp_unsigned("<", pixels(place), centre), lanes.type)
+                    code = builder.or_(code, builder.and_(darker, lanes.constant(1 << bit)))
+                word = builder.or_(word, builder.shl(builder.zext(code, wide.type), wide.constant(8 * part)))
+            wide.store(word, builder.add(target, builder.mul(target_plane, _I64(plane))))
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic(prefer_literal=True)
+def _sample_block(_context: Any, source: Any, width: Any, across: Any, down: Any, target: Any) -> Any:
+    """SAMPLE_BLOCK pixels between four pixels each, by places in 32nds; all but the width are addresses."""
+    signature = types.void(*([types.int64] * 5))
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        source, width, across, down, target = arguments
+        lanes, far = _Lanes(builder, SAMPLE_BLOCK, 32), _Lanes(builder, SAMPLE_BLOCK, 64)
+        x, y = lanes.load(across), lanes.load(down)
+        stride = lanes.splat(builder.trunc(width, _I32))
+        five, parts, low = lanes.constant(5), lanes.constant(32), lanes.constant(255)
+        index = builder.add(builder.mul(builder.ashr(y, five), stride), builder.ashr(x, five))
+        right, below = builder.and_(x, lanes.constant(31)), builder.and_(y, lanes.constant(31))
+        pointers = ir.VectorType(_I32.as_pointer(), SAMPLE_BLOCK)
+        mask = ir.VectorType(ir.IntType(1), SAMPLE_BLOCK)
+        signature = ir.FunctionType(lanes.type, [pointers, _I32, mask, lanes.type])
+        name = f"llvm.masked.gather.v{SAMPLE_BLOCK}i32.v{SAMPLE_BLOCK}p0"
+        gather = cgutils.get_or_insert_function(builder.module, signature, name)
+        every = ir.Constant(mask, [ir.IntType(1)(1)] * SAMPLE_BLOCK)
+        rows = []
+        for place in (index, builder.add(index, stride)):
+            addresses = builder.add(far.splat(source), builder.zext(place, far.type))
+            empty = ir.Constant(lanes.type, ir.Undefined)
+            word = builder.call(gather, [builder.inttoptr(addresses, pointers), _I32(1), every, empty])
+            one = builder.and_(word, low)
+            other = builder.and_(builder.lshr(word, lanes.constant(8)), low)
+            rows.append(builder.add(builder.mul(one, parts), builder.mul(right, builder.sub(other, one))))
+        upper, lower = rows
+        value = builder.add(builder.mul(upper, parts), builder.mul(below, builder.sub(lower, upper)))
+        value = builder.lshr(builder.add(value, lanes.constant(512)), lanes.constant(10))
+        _Lanes(builder, SAMPLE_BLOCK, 8).store(builder.trunc(value, ir.VectorType(_I8, SAMPLE_BLOCK)), target)
         return context.get_dummy_value()
 
     return signature, generate
@@ -253,7 +445,7 @@ def blank_census(planes: Any, missing: Any, blank: int) -> None:
     """Put the blank pattern, cut to the bits that each plane really has, where data are missing."""
     _, rows, columns = planes.shape
     for plane in range(PLANES):
-        pattern = np.uint8(blank & ((1 << min(8, CENSUS_BITS - 8 * plane)) - 1))
+        pattern = np.uint16(blank & ((1 << min(16, CENSUS_BITS - 16 * plane)) - 1))
         for row in range(rows):
             for column in range(columns):
                 if missing[row, column]:
@@ -270,7 +462,7 @@ def census_vector(image: Any, planes: Any) -> None:
         column = HALF_COLUMNS
         while column < columns - HALF_COLUMNS:
             place = row * columns + min(column, last)
-            _census_block(source + place, columns, target + place, rows * columns)
+            _census_block(source + place, columns, target + 2 * place, 2 * rows * columns)
             column += CENSUS_BLOCK
     _clear_frame(planes)
 
@@ -288,10 +480,10 @@ def census_plain(image: Any, planes: Any) -> None:
                     if i == 0 and j == 0:
                         continue
                     if image[row + i, column + j] < image[row, column]:
-                        code |= 1 << (bit % 8)
+                        code |= 1 << (bit % 16)
                     bit += 1
-                    if bit % 8 == 0 or bit == CENSUS_BITS:
-                        planes[(bit - 1) // 8, row, column] = code
+                    if bit % 16 == 0 or bit == CENSUS_BITS:
+                        planes[(bit - 1) // 16, row, column] = code
                         code = 0
     _clear_frame(planes)
 
@@ -308,13 +500,14 @@ def vector_passes(disparities: int) -> Callable[..., None]:
     right_planes : (PLANES, rows, wider) census of a picture that goes on past the left one's sides
     offset : column of the right picture that belongs to left column 0 and the first disparity
     small_step, large_step : penalties of a change by one and by more; large_step + 62 <= 127
-    volume : (rows, columns, disparities) uint16, overwritten
+    volume : (2, rows, columns, disparities) uint8, overwritten: costs; sums of the first sweep, less their leasts
+    leasts : (rows, columns) uint32, overwritten: what was taken off those sums, in both halves of the word
 
     and fills
 
     winners : (rows, columns) uint8, index of the cheapest disparity
     costs : (rows, columns, 4) uint16, at the winner's lower neighbour, at the winner, at its upper neighbour
-        (UNKNOWN_COST beyond the range), and the least of all the others
+        (65535 // disparities beyond the range), and the least of all the others
     right_winners : (rows, columns + disparities) uint8, cheapest index for right column offset + j
     """
 
@@ -326,90 +519,78 @@ def vector_passes(disparities: int) -> Callable[..., None]:
         small_step: int,
         large_step: int,
         volume: Any,
+        leasts: Any,
         winners: Any,
         costs: Any,
         right_winners: Any,
     ) -> None:
         _, rows, columns = left_planes.shape
         right_columns = right_planes.shape[2]
-        states = np.empty((2, columns + 2, 3 * disparities), np.uint8)
-        beside = np.empty(disparities, np.uint8)
-        totals = np.full(disparities + 2, UNKNOWN_COST, np.uint16)
+        states = np.empty((columns + 2, 4, disparities), np.uint8)
+        doubled = np.empty((PLANES, columns), np.uint32)
+        keys = np.full(disparities + 2, UNKNOWN_COST, np.uint16)
         masks = np.zeros(2 * disparities + 1, np.uint16)
         masks[disparities - 1 : disparities + 2] = UNKNOWN_COST
-        right_costs = np.empty(columns + disparities, np.uint16)
-        right_indices = np.empty(columns + disparities, np.uint16)
-        left_address, right_address = left_planes.ctypes.data, right_planes.ctypes.data
-        states_address, beside_address, volume_address = states.ctypes.data, beside.ctypes.data, volume.ctypes.data
-        totals_address, masks_address = totals.ctypes.data + 2, masks.ctypes.data
-        right_costs_address, right_indices_address = right_costs.ctypes.data, right_indices.ctypes.data
+        right_keys = np.zeros(columns + disparities, np.uint16)
         small, large = np.uint8(small_step), np.uint8(large_step)
-        entry = 3 * disparities
-        line = (columns + 2) * entry
-        for sweep in range(2):
-            step = 1 - 2 * sweep
-            states[:] = 0
-            for i in range(rows):
-                row = i if sweep == 0 else rows - 1 - i
-                beside[:] = 0
-                right_costs[:] = UNKNOWN_COST
-                right_indices[:] = 0
-                last = states_address + (i & 1) * line
-                this = states_address + (1 - (i & 1)) * line
-                for j in range(columns):
-                    column = j if sweep == 0 else columns - 1 - j
-                    state = (column + 1) * entry
-                    sums = volume_address + (row * columns + column) * 2 * disparities
-                    _carry_paths(
-                        disparities,
-                        left_address + row * columns + column,
-                        rows * columns,
-                        right_address + row * right_columns + offset + column,
-                        rows * right_columns,
-                        beside_address,
-                        last + state - step * entry,
-                        last + state + disparities,
-                        last + state + 2 * disparities + step * entry,
-                        this + state,
-                        sums if sweep == 0 else totals_address,
-                        small,
-                        large,
-                    )
-                    if sweep == 0:
-                        continue
-                    found = _choose(
-                        disparities,
-                        sums,
-                        totals_address,
-                        masks_address,
-                        right_costs_address + 2 * column,
-                        right_indices_address + 2 * column,
-                    )
-                    winner = found & 0xFFFF
-                    winners[row, column] = winner
-                    costs[row, column, BELOW] = totals[winner]
-                    costs[row, column, BEST] = totals[winner + 1]
-                    costs[row, column, ABOVE] = totals[winner + 2]
-                    costs[row, column, RUNNER_UP] = found >> 16
-                if sweep == 1:
-                    for j in range(columns + disparities):
-                        right_winners[row, j] = right_indices[j]
+        line = columns * disparities
+        costs_address = volume.ctypes.data
+        sums_address = costs_address + rows * line
+        leasts_address, states_address = leasts.ctypes.data, states.ctypes.data
+        states[:] = 0
+        for row in range(rows):
+            for plane in range(PLANES):
+                for column in range(columns):
+                    doubled[plane, column] = np.uint32(left_planes[plane, row, column]) * np.uint32(0x00010001)
+            _sweep_down(
+                disparities,
+                columns,
+                doubled.ctypes.data,
+                4 * columns,
+                right_planes.ctypes.data + 2 * (row * right_columns + offset),
+                2 * rows * right_columns,
+                states_address,
+                costs_address + row * line,
+                sums_address + row * line,
+                leasts_address + row * columns * 4,
+                small,
+                large,
+            )
+        states[:] = 0
+        for row in range(rows - 1, -1, -1):
+            _sweep_up(
+                disparities,
+                columns,
+                states_address,
+                costs_address + row * line,
+                sums_address + row * line,
+                leasts_address + row * columns * 4,
+                masks.ctypes.data,
+                keys.ctypes.data + 2,
+                right_keys.ctypes.data,
+                winners.ctypes.data + row * columns,
+                costs.ctypes.data + row * columns * 8,
+                small,
+                large,
+            )
+            for j in range(columns + disparities):
+                right_winners[row, j] = right_keys[j] & np.uint16(disparities - 1)
 
     return passes
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _bits_set(byte: int) -> int:
-    byte = byte - ((byte >> 1) & 0x55)
-    byte = (byte & 0x33) + ((byte >> 2) & 0x33)
-    return (byte + (byte >> 4)) & 0x0F
+def _bits_set(word: int) -> int:
+    word = word - ((word >> 1) & 0x5555)
+    word = (word & 0x3333) + ((word >> 2) & 0x3333)
+    word = (word + (word >> 4)) & 0x0F0F
+    return (word + (word >> 8)) & 0x1F
 
 
 @njit(nogil=True, cache=True)
-def _carry_path(before: Any, costs: Any, small: int, large: int, after: Any, sums: Any) -> None:
-    """One path over one pixel ([Hirschmuller2008] eq. 13); `after` may be `before`."""
+def _carry_path(before: Any, costs: Any, small: int, large: int, after: Any, carried: Any) -> int:
+    """One path over one pixel ([Hirschmuller2008] eq. 13); returns its least. `after` may be `before`."""
     disparities = len(costs)
-    carried = np.empty(disparities, np.int64)
     for d in range(disparities):
         reached = min(np.int64(before[d]), large)
         if d > 0:
@@ -420,7 +601,7 @@ def _carry_path(before: Any, costs: Any, small: int, large: int, after: Any, sum
     least = carried.min()
     for d in range(disparities):
         after[d] = carried[d] - least
-        sums[d] += carried[d]
+    return least
 
 
 @njit(nogil=True, cache=True)
@@ -431,17 +612,19 @@ def plain_passes(
     small_step: int,
     large_step: int,
     volume: Any,
+    leasts: Any,
     winners: Any,
     costs: Any,
     right_winners: Any,
 ) -> None:
     """The same as `vector_passes` in plain loops, for any number of disparities."""
-    _, rows, columns = left_planes.shape
-    disparities = volume.shape[2]
+    _, rows, columns, disparities = volume.shape
     states = np.zeros((2, columns + 2, 3, disparities), np.uint8)
     beside = np.zeros(disparities, np.uint8)
-    cost = np.empty(disparities, np.int64)
+    carried = np.empty(disparities, np.int64)
+    sums = np.empty(disparities, np.int64)
     right_costs = np.empty(columns + disparities, np.uint16)
+    unknown = UNKNOWN_COST // disparities
     for sweep in range(2):
         step = 1 - 2 * sweep
         states[:] = 0
@@ -454,32 +637,35 @@ def plain_passes(
             last, this = states[i & 1], states[1 - (i & 1)]
             for j in range(columns):
                 column = j if sweep == 0 else columns - 1 - j
-                cost[:] = 0
-                for plane in range(PLANES):
-                    code = left_planes[plane, row, column]
-                    for d in range(disparities):
-                        cost[d] += _bits_set(np.int64(code ^ right_planes[plane, row, offset + column + d]))
-                sums = volume[row, column]
+                cost = volume[0, row, column]
                 if sweep == 0:
-                    sums[:] = 0
-                _carry_path(beside, cost, small_step, large_step, beside, sums)
+                    cost[:] = 0
+                    for plane in range(PLANES):
+                        code = left_planes[plane, row, column]
+                        for d in range(disparities):
+                            cost[d] += _bits_set(np.int64(code ^ right_planes[plane, row, offset + column + d]))
+                least = _carry_path(beside, cost, small_step, large_step, beside, carried)
+                sums[:] = carried
                 for path in range(3):
                     neighbour = last[column + 1 + (path - 1) * step, path]
-                    _carry_path(neighbour, cost, small_step, large_step, this[column + 1, path], sums)
+                    least += _carry_path(neighbour, cost, small_step, large_step, this[column + 1, path], carried)
+                    sums += carried
                 if sweep == 0:
+                    leasts[row, column] = least * 65537
+                    for d in range(disparities):
+                        volume[1, row, column, d] = min(sums[d] - least, 255)
                     continue
-                winner = 0
                 for d in range(disparities):
-                    if sums[d] < sums[winner]:
-                        winner = d
-                runner_up = UNKNOWN_COST
+                    sums[d] += np.int64(volume[1, row, column, d]) + np.int64(leasts[row, column] & 0xFFFF)
+                winner = sums.argmin()
+                runner_up = unknown
                 for d in range(disparities):
                     if abs(d - winner) > 1:
-                        runner_up = min(runner_up, np.int64(sums[d]))
+                        runner_up = min(runner_up, sums[d])
                 winners[row, column] = winner
-                costs[row, column, BELOW] = sums[winner - 1] if winner > 0 else UNKNOWN_COST
+                costs[row, column, BELOW] = sums[winner - 1] if winner > 0 else unknown
                 costs[row, column, BEST] = sums[winner]
-                costs[row, column, ABOVE] = sums[winner + 1] if winner < disparities - 1 else UNKNOWN_COST
+                costs[row, column, ABOVE] = sums[winner + 1] if winner < disparities - 1 else unknown
                 costs[row, column, RUNNER_UP] = runner_up
                 for d in range(disparities):
                     if sums[d] < right_costs[column + d]:
@@ -490,7 +676,7 @@ def plain_passes(
 # --- from winners to disparities --------------------------------------------------------------------------------------
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def select(
     winners: Any,
     costs: Any,
@@ -499,6 +685,8 @@ def select(
     right_flags: Any,
     inconsistent_flag: int,
     edge_flag: int,
+    tolerated: int,
+    whole: bool,
     disparity: Any,
     flags: Any,
     confidence: Any,
@@ -508,36 +696,66 @@ def select(
     prior and right_flags are wider than the left picture by the same number of columns on both sides. With k the
     disparity that was left over, d(x) = k + prior(x + k). Between whole disparities the cost is taken to fall and rise
     with equal slopes, as sums of Hamming distances do; a parabola more than doubles the noise of smooth ground.
+    Where there is a flag beyond the tolerated ones, disparity is NaN or, if `whole`, what was known before.
     """
     rows, columns = winners.shape
     margin = (prior.shape[1] - columns) // 2
     disparities = right_winners.shape[1] - columns
-    half = disparities // 2
+    half, last = np.int32(disparities // 2), np.int32(disparities - 1)
+    shift = margin - disparities // 2
+    at_edge, inconsistent, none = np.uint8(edge_flag), np.uint8(inconsistent_flag), np.uint8(0)
+    fatal = np.uint8(~tolerated & 0xFF)
+    zero, one = np.float32(0), np.float32(1)
+    fractions = np.empty(columns, np.float32)
+    befores, afters = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    others, theirs = np.empty(columns, np.uint8), np.empty(columns, np.uint8)
+    # Many loops without jumps and with few arrays, so that all but those that look up become vector code.
     for row in range(rows):
+        chosen, given, ours = winners[row], disparity[row], flags[row]
         for column in range(columns):
-            winner = np.int64(winners[row, column])
-            best = np.float32(costs[row, column, BEST])
-            flag = flags[row, column]
-            fraction = np.float32(0)
-            if winner == 0 or winner == disparities - 1:
-                flag |= edge_flag
-            else:
-                below = np.float32(costs[row, column, BELOW]) - best
-                above = np.float32(costs[row, column, ABOVE]) - best
-                steeper = max(below, above)
-                if steeper > 0:
-                    fraction = np.float32(0.5) * (below - above) / steeper
-            if abs(np.int64(right_winners[row, column + winner]) - winner) > 1:
-                flag |= inconsistent_flag
-            is_before = int(fraction < 0)
-            start = column + margin + winner - half - is_before
-            weight = fraction + np.float32(is_before)
-            before, after = prior[row, start], prior[row, start + 1]
-            nearest = start + int(weight >= np.float32(0.5))
-            flags[row, column] = flag | right_flags[row, nearest]
-            disparity[row, column] = np.float32(winner - half) + fraction + before + weight * (after - before)
-            runner_up = np.float32(costs[row, column, RUNNER_UP])
-            confidence[row, column] = np.uint8(np.float32(255) * (runner_up - best) / (runner_up + np.float32(0.001)))
+            best = np.int32(costs[row, column, BEST])
+            below = np.float32(np.int32(costs[row, column, BELOW]) - best)
+            above = np.float32(np.int32(costs[row, column, ABOVE]) - best)
+            steeper = max(below, above)
+            fractions[column] = np.float32(0.5) * (below - above) / (steeper if steeper > zero else one)
+        for column in range(columns):
+            best, runner_up = np.float32(costs[row, column, BEST]), np.float32(costs[row, column, RUNNER_UP])
+            share = np.float32(255) * (runner_up - best) / (runner_up + np.float32(0.001))
+            confidence[row, column] = np.uint8(np.int32(share))
+        for column in range(columns):
+            winner = np.int32(chosen[column])
+            fractions[column] = zero if (winner == 0) | (winner == last) else fractions[column]
+        line = prior[row]
+        for column in range(columns):
+            start = np.uint64(column + shift + np.int64(chosen[column])) - np.uint64(fractions[column] < zero)
+            befores[column] = line[start]
+            afters[column] = line[start + np.uint64(1)]
+        line = right_winners[row]
+        for column in range(columns):
+            others[column] = line[np.uint64(column + np.int64(chosen[column]))]
+        line = right_flags[row]
+        half_down, half_up = np.float32(-0.5), np.float32(0.5)
+        for column in range(columns):
+            place = np.uint64(column + shift + np.int64(chosen[column]))
+            up, down = np.uint64(fractions[column] >= half_up), np.uint64(fractions[column] < half_down)
+            theirs[column] = line[place + up - down]
+        for column in range(columns):
+            winner = np.int32(chosen[column])
+            apart = np.int32(others[column]) - winner
+            found = inconsistent if (apart > 1) | (apart < -1) else none
+            found |= at_edge if (winner == 0) | (winner == last) else none
+            ours[column] |= found | theirs[column]
+        for column in range(columns):
+            fraction = fractions[column]
+            weight = fraction + (one if fraction < zero else zero)
+            coarse = np.float32(np.int32(chosen[column]) - half)
+            given[column] = coarse + fraction + befores[column] + weight * (afters[column] - befores[column])
+        if whole:
+            befores[:] = prior[row, margin : margin + columns]
+        else:
+            befores[:] = np.nan
+        for column in range(columns):
+            given[column] = given[column] if ours[column] & fatal == 0 else befores[column]
 
 
 # --- what pictures and disparity maps decide alone -------------------------------------------------------------------
@@ -600,7 +818,7 @@ def _add_line(line: Any, sign: int, saturated_from: int, sums: Any, squares: Any
         squares[column] += np.int32(sign * np.int32(value * value))
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def correlate_windows(left: Any, right: Any, half: int, least_variance: float, found: Any) -> None:
     """Normalised correlation of two pictures in the windows of 2 half + 1 pixels a side about every pixel.
 
@@ -608,50 +826,108 @@ def correlate_windows(left: Any, right: Any, half: int, least_variance: float, f
     windows of up to 15 pixels a side exactly. least_variance: geometric mean of the variances from which it counts.
     """
     rows, columns = left.shape
-    sums = np.zeros((5, columns + 2 * half), np.int32)  # down the window's height, with nothing beside the picture
-    totals = np.empty((5, columns), np.int32)
+    side = 2 * half + 1
+    # Down the window's height, with nothing beside the picture: a, b, a^2, b^2, ab; then summed from the left.
+    beyond = columns + 2 * half
+    sums_a, sums_b = np.zeros(beyond, np.int32), np.zeros(beyond, np.int32)
+    sums_aa, sums_bb, sums_ab = np.zeros(beyond, np.int32), np.zeros(beyond, np.int32), np.zeros(beyond, np.int32)
+    inner_a, inner_b = sums_a[half:], sums_b[half:]
+    inner_aa, inner_bb, inner_ab = sums_aa[half:], sums_bb[half:], sums_ab[half:]
+    running = np.zeros((5, columns + side), np.int32)
     widths = np.empty(columns, np.int32)
     for column in range(columns):
         widths[column] = min(column + half, columns - 1) - max(column - half, 0) + 1
     least = np.float32(least_variance * least_variance)
     for row in range(-half, rows):
         if row + half < rows:
-            _add_products(left[row + half], right[row + half], np.int32(1), sums[:, half:])
+            _add_values(left[row + half], np.int32(1), inner_a, inner_aa)
+            _add_values(right[row + half], np.int32(1), inner_b, inner_bb)
+            _add_products(left[row + half], right[row + half], np.int32(1), inner_ab)
         if row - half - 1 >= 0:
-            _add_products(left[row - half - 1], right[row - half - 1], np.int32(-1), sums[:, half:])
+            _add_values(left[row - half - 1], np.int32(-1), inner_a, inner_aa)
+            _add_values(right[row - half - 1], np.int32(-1), inner_b, inner_bb)
+            _add_products(left[row - half - 1], right[row - half - 1], np.int32(-1), inner_ab)
         if row < 0:
             continue
-        for i in range(5):
-            line, total = sums[i], np.int32(0)
-            for column in range(2 * half):
-                total = np.int32(total + line[column])
-            for column in range(columns):
-                total = np.int32(total + line[column + 2 * half])
-                totals[i, column] = total
-                total = np.int32(total - line[column])
+        a, b, aa, bb, ab = np.int32(0), np.int32(0), np.int32(0), np.int32(0), np.int32(0)
+        for column in range(columns + 2 * half):
+            a, b = np.int32(a + sums_a[column]), np.int32(b + sums_b[column])
+            aa, bb = np.int32(aa + sums_aa[column]), np.int32(bb + sums_bb[column])
+            ab = np.int32(ab + sums_ab[column])
+            running[0, column + 1], running[1, column + 1] = a, b
+            running[2, column + 1], running[3, column + 1], running[4, column + 1] = aa, bb, ab
         height = np.int32(min(row + half, rows - 1) - max(row - half, 0) + 1)
-        a, b, aa, bb, ab = totals[0], totals[1], totals[2], totals[3], totals[4]
         for column in range(columns):
+            a = np.int32(running[0, column + side] - running[0, column])
+            b = np.int32(running[1, column + side] - running[1, column])
+            aa = np.int32(running[2, column + side] - running[2, column])
+            bb = np.int32(running[3, column + side] - running[3, column])
+            ab = np.int32(running[4, column + side] - running[4, column])
             size = np.int32(height * widths[column])
-            covariance = np.int32(np.int32(size * ab[column]) - np.int32(a[column] * b[column]))  # size^2 times it
-            one = np.int32(np.int32(size * aa[column]) - np.int32(a[column] * a[column]))
-            other = np.int32(np.int32(size * bb[column]) - np.int32(b[column] * b[column]))
+            covariance = np.int32(np.int32(size * ab) - np.int32(a * b))  # size^2 times it
+            one = np.int32(np.int32(size * aa) - np.int32(a * a))
+            other = np.int32(np.int32(size * bb) - np.int32(b * b))
             area = np.float32(np.int32(size * size))
             variances = max(np.float32(one) * np.float32(other), least * area * area)
             found[row, column] = np.float32(covariance) / np.sqrt(variances)
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _add_products(left: Any, right: Any, sign: int, sums: Any) -> None:
-    """Add (or take away) a line of grey values, their squares and their products."""
+def _add_values(line: Any, sign: int, sums: Any, squares: Any) -> None:
+    """Add (or take away) a line of grey values, counted from mid-grey, and their squares."""
+    for column in range(len(line)):
+        value = np.int32(np.int32(line[column]) - np.int32(128))
+        sums[column] += np.int32(sign * value)
+        squares[column] += np.int32(sign * np.int32(value * value))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _add_products(left: Any, right: Any, sign: int, products: Any) -> None:
+    """Add (or take away) the products of two lines of grey values, counted from mid-grey."""
     for column in range(len(left)):
         a = np.int32(np.int32(left[column]) - np.int32(128))
         b = np.int32(np.int32(right[column]) - np.int32(128))
-        sums[0, column] += np.int32(sign * a)
-        sums[1, column] += np.int32(sign * b)
-        sums[2, column] += np.int32(sign * np.int32(a * a))
-        sums[3, column] += np.int32(sign * np.int32(b * b))
-        sums[4, column] += np.int32(sign * np.int32(a * b))
+        products[column] += np.int32(sign * np.int32(a * b))
+
+
+@njit(nogil=True, cache=True)
+def clean(
+    disparity: Any,
+    alike: Any,
+    uniqueness: Any,
+    least_correlation: float,
+    least_uniqueness: float,
+    unlike_flag: int,
+    ambiguous_flag: int,
+    flags: Any,
+    similarity: Any,
+) -> None:
+    """Take out what is flagged, does not look alike or does not stand out; correlation as a byte."""
+    rows, columns = disparity.shape
+    least_correlation, least_uniqueness = np.float32(least_correlation), np.float32(least_uniqueness)
+    unlike, ambiguous = np.uint8(unlike_flag), np.uint8(ambiguous_flag)
+    zero, one = np.float32(0), np.float32(1)
+    for row in range(rows):
+        for column in range(columns):
+            value = alike[row, column]
+            flag = flags[row, column]
+            doubts = unlike if value < least_correlation else np.uint8(0)
+            doubts |= ambiguous if np.float32(uniqueness[row, column]) < least_uniqueness else np.uint8(0)
+            flag |= doubts if flag == 0 else np.uint8(0)
+            flags[row, column] = flag
+            disparity[row, column] = disparity[row, column] if flag == 0 else np.float32(np.nan)
+            similarity[row, column] = np.uint8(np.int32(np.float32(255) * min(max(value, zero), one)))
+
+
+@njit(nogil=True, cache=True)
+def take_out(where: Any, flag: int, disparity: Any, flags: Any) -> None:
+    """Give the flag to pixels, in place of their disparity."""
+    rows, columns = where.shape
+    flag = np.uint8(flag)
+    for row in range(rows):
+        for column in range(columns):
+            flags[row, column] |= flag if where[row, column] else np.uint8(0)
+            disparity[row, column] = np.float32(np.nan) if where[row, column] else disparity[row, column]
 
 
 @njit(nogil=True, cache=True)
@@ -668,85 +944,163 @@ def islands(disparity: Any, step: float, largest: int, found: Any) -> None:
     """Set `found` where a disparity belongs to an island of at most `largest` pixels.
 
     Neighbours left, right, above and below hang together where they differ by at most `step`. Runs along rows are
-    joined, which takes one look at each pixel and few joins.
+    joined, so that smooth ground costs two comparisons a pixel, in vector code.
     """
     rows, columns = disparity.shape
     step = np.float32(step)
-    runs = np.empty((rows, columns), np.int32)
-    parents = np.empty(rows * columns, np.int32)
-    sizes = np.empty(rows * columns, np.int32)
+    # Only what runs there are is ever touched.
+    starts, ends = np.empty(rows * columns, np.int32), np.empty(rows * columns, np.int32)
+    parents, sizes = np.empty(rows * columns, np.int32), np.empty(rows * columns, np.int32)
+    first_runs = np.empty(rows + 1, np.int64)
+    words = (columns + 8) // 8
+    place = np.zeros(8 * words, np.uint8)  # 0: no disparity (also beyond the row), 1: goes on from the left, 2: starts
+    linked = np.empty(columns, np.bool_)
+    eight = place.view(np.uint64)
     count = 0
     for row in range(rows):
-        joined = -1  # the run above that this run was joined with last
-        for column in range(columns):
+        first_runs[row] = count
+        place[0] = 0 if np.isnan(disparity[row, 0]) else 2
+        for column in range(1, columns):
             value = disparity[row, column]
-            if np.isnan(value):
-                runs[row, column] = -1
+            goes_on = abs(value - disparity[row, column - 1]) <= step
+            place[column] = np.uint8(1) if goes_on else (np.uint8(2) if value == value else np.uint8(0))
+        within = False
+        for word in range(words):
+            if eight[word] == (0x0101010101010101 if within else 0):
                 continue
-            if column > 0 and abs(value - disparity[row, column - 1]) <= step:
-                run = runs[row, column - 1]
-                sizes[run] += 1
-            else:
-                run = count
-                parents[run] = run
-                sizes[run] = 1
-                count += 1
-                joined = -1
-            runs[row, column] = run
-            if row > 0 and abs(value - disparity[row - 1, column]) <= step and runs[row - 1, column] != joined:
-                joined = runs[row - 1, column]
-                one, other = _root(parents, run), _root(parents, joined)
-                parents[max(one, other)] = min(one, other)
+            for column in range(8 * word, 8 * word + 8):
+                if place[column] == 1:
+                    continue
+                if within:
+                    ends[count - 1] = column
+                within = place[column] == 2
+                if within:
+                    starts[count] = column
+                    parents[count] = count
+                    count += 1
+        for run in range(first_runs[row], count):
+            sizes[run] = ends[run] - starts[run]
+        if row == 0:
+            continue
+        for column in range(columns):
+            linked[column] = abs(disparity[row, column] - disparity[row - 1, column]) <= step
+        above = first_runs[row - 1]
+        for run in range(first_runs[row], count):
+            while above < first_runs[row] and ends[above] <= starts[run]:
+                above += 1
+            other = above
+            while other < first_runs[row] and starts[other] < ends[run]:
+                for column in range(max(starts[other], starts[run]), min(ends[other], ends[run])):
+                    if linked[column]:
+                        one, another = _root(parents, run), _root(parents, other)
+                        parents[max(one, another)] = min(one, another)
+                        break
+                other += 1
+    first_runs[rows] = count
     for run in range(count - 1, -1, -1):  # a root is the first run of its island
         root = _root(parents, run)
         if root != run:
             sizes[root] += sizes[run]
-    for run in range(count):
-        sizes[run] = sizes[parents[run]] if parents[run] != run else sizes[run]
     for row in range(rows):
-        for column in range(columns):
-            run = runs[row, column]
-            found[row, column] = run >= 0 and sizes[run] <= largest
+        found[row] = False
+        for run in range(first_runs[row], first_runs[row + 1]):
+            if sizes[_root(parents, run)] <= largest:
+                found[row, starts[run] : ends[run]] = True
 
 
 # --- resampling and filling -------------------------------------------------------------------------------------------
 
 
 @njit(nogil=True, cache=True)
-def warp_maps(
+def resample_vector(
+    source: Any, prior: Any, field: Any, field_place: Any, scale: float, offset_x: float, offset_y: float, target: Any
+) -> None:
+    """Read each pixel of the target one prior aside and one field value down, between pixels bilinearly.
+
+    source : (rows + 2 RIM, columns + 2 RIM) uint8, with zeros around
+    prior, target : (rows, columns), of at least SAMPLE_BLOCK columns
+    field, field_place : nodes; node row and column of pixel (0, 0), then nodes per row and per column; between nodes
+        the field is bilinear, beyond them constant
+    scale : pixels of this level in one of the field's
+    offset_x, offset_y : place in the source, without its rim, of a pixel whose prior and field are zero
+    """
+    rows, columns = prior.shape
+    across, down = np.empty(columns, np.int32), np.empty(columns, np.int32)
+    width = source.shape[1]
+    for row in range(rows):
+        _places_read(row, source, prior, field, field_place, scale, offset_x, offset_y, across, down)
+        column = 0
+        while column < columns:
+            start = min(column, columns - SAMPLE_BLOCK)
+            _sample_block(
+                source.ctypes.data,
+                width,
+                across.ctypes.data + 4 * start,
+                down.ctypes.data + 4 * start,
+                target.ctypes.data + row * columns + start,
+            )
+            column += SAMPLE_BLOCK
+
+
+@njit(nogil=True, cache=True)
+def resample_plain(
+    source: Any, prior: Any, field: Any, field_place: Any, scale: float, offset_x: float, offset_y: float, target: Any
+) -> None:
+    """The same as `resample_vector` in plain loops, for any number of columns."""
+    rows, columns = prior.shape
+    across, down = np.empty(columns, np.int32), np.empty(columns, np.int32)
+    for row in range(rows):
+        _places_read(row, source, prior, field, field_place, scale, offset_x, offset_y, across, down)
+        for column in range(columns):
+            x, y = across[column] >> 5, down[column] >> 5
+            right, below = across[column] & 31, down[column] & 31
+            upper = 32 * source[y, x] + right * (np.int32(source[y, x + 1]) - np.int32(source[y, x]))
+            lower = 32 * source[y + 1, x] + right * (np.int32(source[y + 1, x + 1]) - np.int32(source[y + 1, x]))
+            target[row, column] = (32 * upper + below * (lower - upper) + 512) >> 10
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _places_read(
+    row: int,
+    source: Any,
     prior: Any,
     field: Any,
     field_place: Any,
     scale: float,
     offset_x: float,
     offset_y: float,
-    map_x: Any,
-    map_y: Any,
+    across: Any,
+    down: Any,
 ) -> None:
-    """Where each pixel of the resampled right picture is read: one prior aside and one field value down.
-
-    field_place: node row and column of pixel (0, 0), then nodes per row and per column; between nodes the field is
-    bilinear, beyond them constant. scale: pixels of this level in one of the field's.
-    """
+    """Where the pixels of a row are read, in 32nds of a pixel of the source; beyond the source, on its rim."""
     row_start, column_start, row_step, column_step = field_place
-    rows, columns = prior.shape
+    columns = prior.shape[1]
     field_rows, field_columns = field.shape
-    line = np.empty(field_columns, np.float32)
-    for row in range(rows):
-        x = np.float32(offset_x)
-        for column in range(columns):
-            map_x[row, column] = (x + np.float32(column)) + prior[row, column]
-        y = np.float32(offset_y + row)
-        first, weight = _node(row_start + row * row_step, field_rows)
-        second = min(first + 1, field_rows - 1)
-        for j in range(field_columns):
-            line[j] = y + np.float32(scale) * (field[first, j] + weight * (field[second, j] - field[first, j]))
-        if field_columns == 1:
-            map_y[row] = line[0]
-            continue
-        for column in range(columns):
-            first, weight = _node(column_start + column * column_step, field_columns)
-            map_y[row, column] = line[first] + weight * (line[first + 1] - line[first])
+    parts, zero = np.float32(32), np.float32(0)
+    line = prior[row]
+    x, highest = np.float32(offset_x + RIM), np.float32(32 * (source.shape[1] - RIM))
+    for column in range(columns):
+        across[column] = np.int32(np.rint(min(max(parts * ((x + np.float32(column)) + line[column]), zero), highest)))
+    highest = np.float32(32 * (source.shape[0] - RIM))
+    y = np.float32(offset_y + RIM + row)
+    first, weight = _node(row_start + row * row_step, field_rows)
+    second = min(first + 1, field_rows - 1)
+    start = 0
+    for node in range(field_columns):  # the pixels from each node to the next
+        stop = columns
+        if node < field_columns - 2:
+            stop = min(max(int(np.ceil((node + 1 - column_start) / column_step)), start), columns)
+        elif node == field_columns - 1 and node > 0:
+            break
+        beyond = min(node + 1, field_columns - 1)
+        here = field[first, node] + weight * (field[second, node] - field[first, node])
+        there = field[first, beyond] + weight * (field[second, beyond] - field[first, beyond])
+        here, there = y + np.float32(scale) * here, y + np.float32(scale) * there
+        for column in range(start, stop):
+            along = np.float32(column_start + column * column_step - node)
+            value = here + min(max(along, zero), np.float32(1)) * (there - here)
+            down[column] = np.int32(np.rint(min(max(parts * value, zero), highest)))
+        start = stop
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -757,7 +1111,7 @@ def _node(place: float, count: int) -> tuple[int, np.float32]:
     return first, np.float32(place - first)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def halve(values: Any) -> tuple[Any, int]:
     """Means of the finite values of every 2 x 2 block, NaN where there is none, and how many are NaN."""
     rows, columns = values.shape
@@ -779,6 +1133,35 @@ def halve(values: Any) -> tuple[Any, int]:
             missing += count == 0
             coarse[i, j] = (totals[2 * j] + totals[2 * j + 1]) / count if count > 0 else np.float32(np.nan)
     return coarse, missing
+
+
+@njit(nogil=True, cache=True)
+def enlarge(coarse: Any, first_row: int, first_column: int, fine: Any) -> None:
+    """Twice the values of `coarse` at twice its size, pixel i on pixel 2 i, bilinear between, constant beyond.
+
+    fine : (rows, columns), filled; its first pixel lies at (first_row, first_column) of the whole doubled picture.
+    """
+    rows, columns = fine.shape
+    coarse_rows, coarse_columns = coarse.shape
+    line = np.empty(columns // 2 + 2, np.float32)  # half of what is to come, at every coarse column
+    start = first_column >> 1
+    odd = first_column & 1
+    for row in range(rows):
+        above = (first_row + row) >> 1
+        below = above + ((first_row + row) & 1)
+        upper = coarse[min(max(above, 0), coarse_rows - 1)]
+        lower = coarse[min(max(below, 0), coarse_rows - 1)]
+        first, last = min(max(-start, 0), len(line)), min(max(coarse_columns - start, 0), len(line))
+        line[:first] = np.float32(0.5) * (upper[0] + lower[0])
+        line[last:] = np.float32(0.5) * (upper[coarse_columns - 1] + lower[coarse_columns - 1])
+        for column in range(first, last):
+            line[column] = np.float32(0.5) * (upper[start + column] + lower[start + column])
+        target = fine[row]
+        for column in range((columns + odd + 1) // 2):
+            if 2 * column - odd >= 0:
+                target[2 * column - odd] = line[column] + line[column]
+            if 2 * column + 1 - odd < columns:
+                target[2 * column + 1 - odd] = line[column] + line[column + 1]
 
 
 @njit(nogil=True, cache=True)
@@ -807,34 +1190,59 @@ def fill_from(values: Any, coarse: Any) -> None:
 
 
 @njit(nogil=True, cache=True)
-def claim_columns(disparity: Any, support: Any, width: int, apart: int, lost: Any) -> None:
+def contested_rows(disparity: Any, apart: int, contested: Any) -> None:
+    """Mark rows in which two left pixels, more than `apart` apart, share a pixel of the right picture or neighbours."""
+    rows, columns = disparity.shape
+    places = np.empty(columns, np.int32)
+    for row in range(rows):
+        _places(disparity[row], places)
+        furthest = np.int32(-(2**30))
+        found = False
+        for column in range(apart + 1, columns):
+            furthest = max(furthest, places[column - apart - 1])
+            found |= (places[column] <= furthest + 1) & (places[column] > -(2**30))
+        contested[row] = found
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _places(disparity: Any, places: Any) -> None:
+    """Column of the right picture for each left pixel of a row, far to the left where there is no disparity."""
+    for column in range(len(disparity)):
+        value = disparity[column]
+        place = np.int32(np.rint(np.float32(column) + (value if value == value else np.float32(0))))
+        places[column] = place if value == value else np.int32(-(2**30))
+
+
+@njit(nogil=True, cache=True)
+def claim_columns(disparity: Any, support: Any, contested: Any, width: int, apart: int, lost: Any) -> None:
     """Mark matches whose right pixel is better matched with a left pixel that lies elsewhere.
 
     disparity : (rows, columns), NaN where there is none
     support : (rows, columns) uint8, the weight of each claim
+    contested : (rows,) bool, rows to look at
     width : columns of the right picture
     apart : two left pixels at most so far apart may share a right one, as foreshortened slopes do
     lost : (rows, columns) bool, filled
     """
     rows, columns = disparity.shape
     best = np.empty(width + 2, np.uint8)
-    claimant = np.empty(width + 2, np.int64)
+    claimant = np.empty(width + 2, np.int32)
+    places = np.empty(columns, np.int32)
     for row in range(rows):
+        lost[row] = False
+        if not contested[row]:
+            continue
         best[:] = 0
+        _places(disparity[row], places)
         for column in range(columns):
-            value = disparity[row, column]
-            lost[row, column] = False
-            if np.isnan(value):
-                continue
-            place = int(np.rint(column + value)) + 1
+            place = places[column] + 1
             if 0 < place <= width and support[row, column] > best[place]:
                 best[place] = support[row, column]
                 claimant[place] = column
         for column in range(columns):
-            value = disparity[row, column]
-            if np.isnan(value):
+            if places[column] == -(2**30):
                 continue
-            place = min(max(int(np.rint(column + value)) + 1, 1), width)
+            place = min(max(places[column] + 1, 1), width)
             for near in range(place - 1, place + 2):
                 if best[near] > support[row, column] and abs(claimant[near] - column) > apart:
                     lost[row, column] = True

@@ -29,9 +29,15 @@ class DisparityMap:
 
 
 def select_disparities(
-    found: Winners, prior: Float32Array, *, left_validity: ByteArray, right_validity: ByteArray
+    found: Winners,
+    prior: Float32Array,
+    *,
+    left_validity: ByteArray,
+    right_validity: ByteArray,
+    tolerated: int = 0,
+    whole: bool = False,
 ) -> DisparityMap:
-    """Disparities of one picture, every one given, with validity bits for the doubtful ones.
+    """Disparities of one picture, with validity bits for the doubtful ones.
 
     The right picture was resampled by `prior`, so what the winners tell is the disparity k that is left over:
     d(x) = k + prior(x + k). A winner counts as inconsistent where the right pixel it points to prefers another left
@@ -43,6 +49,10 @@ def select_disparities(
         Disparity with which the right picture was resampled, going on past the left picture's sides.
     left_validity, right_validity : arrays of the shapes of the left and of the resampled right picture
         Bits that the pictures alone decide.
+    tolerated : int
+        Bits in spite of which there is a disparity.
+    whole : bool
+        Put `prior` where there is no disparity, instead of NaN.
     """
     shape = found.winners.shape
     result = DisparityMap(
@@ -56,6 +66,8 @@ def select_disparities(
         right_validity,
         int(Validity.INCONSISTENT),
         int(Validity.AT_RANGE_EDGE),
+        tolerated,
+        whole,
         result.disparity,
         result.validity,
         result.confidence,

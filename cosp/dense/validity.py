@@ -85,15 +85,10 @@ def correlation(left: ByteArray, right: ByteArray) -> Float32Array:
     return found
 
 
-def ambiguous(confidence: ByteArray, least_uniqueness: float) -> BoolArray:
-    """Where the mean confidence of the window about a pixel is too low: that of one pixel is noise.
-
-    least_uniqueness : float
-        Share of the cost by which the best match is cheaper than the runner-up.
-    """
+def uniqueness(confidence: ByteArray) -> ByteArray:
+    """Mean confidence of the window about a pixel: that of one pixel is noise."""
     size = (CORRELATION_WINDOW_PX, CORRELATION_WINDOW_PX)
-    mean = cv2.boxFilter(confidence, -1, size, borderType=cv2.BORDER_REFLECT)
-    return np.asarray(mean < 255 * least_uniqueness)
+    return np.asarray(cv2.boxFilter(confidence, -1, size, borderType=cv2.BORDER_REFLECT), np.uint8)
 
 
 def speckles(disparity: Float32Array, *, largest_speckle_px: int, speckle_step_px: float) -> BoolArray:
@@ -120,12 +115,19 @@ def doubly_claimed(disparity: Float32Array, confidence: ByteArray, right_columns
     right_columns : int
         Width of the right picture.
     """
-    given = np.where(np.isnan(disparity), np.uint8(0), confidence)
-    size = (CLAIM_WINDOW_PX, CLAIM_WINDOW_PX)
-    # In whole numbers, so that a strip and the whole picture round alike.
-    support = cv2.boxFilter(given, -1, size, borderType=cv2.BORDER_CONSTANT)
-    lost = np.empty(disparity.shape, np.bool_)
-    kernels.claim_columns(disparity, support, right_columns, SHARED_PX, lost)
+    contested = np.empty(len(disparity), np.bool_)
+    kernels.contested_rows(disparity, SHARED_PX, contested)
+    lost = np.zeros(disparity.shape, np.bool_)
+    for start in range(0, len(disparity), CLAIM_WINDOW_PX):
+        rows = slice(start, start + CLAIM_WINDOW_PX)
+        if not contested[rows].any():
+            continue
+        around = slice(max(start - CLAIM_WINDOW_PX // 2, 0), start + CLAIM_WINDOW_PX + CLAIM_WINDOW_PX // 2)
+        given = np.where(np.isnan(disparity[around]), np.uint8(0), confidence[around])
+        # In whole numbers, so that a strip and the whole picture round alike.
+        support = cv2.boxFilter(given, -1, (CLAIM_WINDOW_PX, CLAIM_WINDOW_PX), borderType=cv2.BORDER_CONSTANT)
+        support = support[start - around.start :][:CLAIM_WINDOW_PX]
+        kernels.claim_columns(disparity[rows], support, contested[rows], right_columns, SHARED_PX, lost[rows])
     return lost
 
 
