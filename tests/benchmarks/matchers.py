@@ -291,16 +291,8 @@ def main() -> int:
                 made = (options.reference_m, options.reference_error_m, options.stretch_mm)
                 make_reference(folder, scene, Path(reference), *made)
             for name in names:
-                command = [
-                    sys.executable,
-                    str(Path(__file__)),
-                    "--folder",
-                    str(folder),
-                    "--one",
-                    scene,
-                    name,
-                    reference,
-                ]
+                command = [sys.executable, str(Path(__file__)), "--folder", str(folder)]
+                command += ["--one", scene, name, reference, str(sigma_m)]
                 done = subprocess.run(command, capture_output=True, text=True)
                 if done.returncode:
                     print(f"skipped {name}: {done.stderr.strip().splitlines()[-1]}")
