@@ -89,29 +89,21 @@ def grid_points(
         rows,
         columns,
     )
-    seeds = kernels.neighbourhood_medians(kernels.cell_medians(ordered, starts, rows, columns))
-    along_columns, along_rows = kernels.slopes_per_cell(seeds)
-    scatter = kernels.cell_scatter(ordered, starts, seeds, along_columns, along_rows, point_sigma_m)
-    moments = kernels.cell_moments(
+    medians = kernels.cell_medians(ordered, starts, rows, columns)
+    seeds = kernels.neighbourhood_medians(medians)
+    slopes = kernels.slopes_per_cell(seeds)
+    scatter = kernels.neighbourhood_medians(kernels.cell_scatter(ordered, starts, seeds, *slopes, point_sigma_m))
+    height, deviation, independent, count = kernels.local_planes(
         ordered,
         starts,
         seeds,
-        along_columns,
-        along_rows,
-        kernels.neighbourhood_medians(scatter),
-        gate_sigmas,
-    )
-    height, deviation, independent = kernels.local_planes(
-        moments,
-        seeds,
-        along_columns,
-        along_rows,
+        *slopes,
+        kernels.gate_limits(seeds, medians, scatter, gate_sigmas),
         math.exp(-1 / (2 * kernel_cells**2)),
         _SLOPE_WEIGHT,
         _NEIGHBOURS_TO_FILL,
         points_per_independent,
     )
-    count = moments[..., 10].astype(np.int32)
     sigma = np.maximum(deviation, np.float32(point_sigma_m)) / np.sqrt(independent)
     return GriddedHeights(height, sigma.astype(np.float32), count)
 

@@ -135,83 +135,52 @@ def sort_by_cell(
 
 
 @njit(nogil=True, cache=True)
-def _select(values: FloatArray, count: int, rank: int) -> float:
-    """The value of this rank among the first `count`; reorders them (Hoare's selection)."""
-    low = 0
-    high = count - 1
-    while low < high:
-        pivot = values[(low + high) // 2]
-        i = low
-        j = high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if rank <= j:
-            high = j
-        elif rank >= i:
-            low = i
-        else:
-            break
-    result: float = values[rank]
-    return result
-
-
-@njit(nogil=True, cache=True)
-def _median_of_nine(v: FloatArray) -> float:
-    """Median of the first nine values, without branches: what each exchange orders is known beforehand."""
-    a, b, c = _ordered(v[0], v[1], v[2])
-    d, e, f = _ordered(v[3], v[4], v[5])
-    g, h, i = _ordered(v[6], v[7], v[8])
-    low = max(max(a, d), g)
-    middle = _ordered(b, e, h)[1]
-    high = min(min(c, f), i)
-    result: float = _ordered(low, middle, high)[1]
-    return result
-
-
-@njit(nogil=True, cache=True)
 def _ordered(a: float, b: float, c: float) -> tuple[float, float, float]:
     low = min(a, b)
     high = max(a, b)
     return min(low, c), max(low, min(high, c)), max(high, c)
 
 
+# Medians without branches: what each exchange orders is known beforehand, so that many are taken side by side.
 @njit(nogil=True, cache=True)
-def _median(values: FloatArray, count: int) -> float:
-    if count == 9:
-        nine: float = _median_of_nine(values)
-        return nine
-    upper: float = _select(values, count, count // 2)
-    if count % 2:
-        return upper
-    lower: float = values[0]
-    for i in range(1, count // 2):
-        lower = max(lower, values[i])
-    return 0.5 * (lower + upper)
+def _median_of_five(a: float, b: float, c: float, d: float, e: float) -> float:
+    result: float = _ordered(max(min(a, b), min(c, d)), min(max(a, b), max(c, d)), e)[1]
+    return result
 
 
-# Points of a cell that medians are taken of: they only say what lies far off, which a sample does as well.
-_MOST_SAMPLED = 9
+@njit(nogil=True, cache=True)
+def _median_of_nine(a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float) -> float:
+    a, b, c = _ordered(a, b, c)
+    d, e, f = _ordered(d, e, f)
+    g, h, i = _ordered(g, h, i)
+    middle = _ordered(b, e, h)[1]
+    result: float = _ordered(max(max(a, d), g), middle, min(min(c, f), i))[1]
+    return result
 
 
 @njit(nogil=True, cache=True)
 def cell_medians(ordered: FloatArray, starts: IntArray, rows: int, columns: int) -> FloatArray:
-    """Median height of the points of each cell, of an even sample where there are many; NaN where there are none."""
-    values = np.empty(_MOST_SAMPLED, np.float32)
+    """Median height of nine points of each cell, evenly taken; NaN where there are none.
+
+    Medians here only say what lies far off, which a sample does as well. Of fewer points some count twice.
+    """
     medians = np.full((rows, columns), np.nan, np.float32)
-    for cell in range(rows * columns):
-        count = starts[cell + 1] - starts[cell]
-        if count:
-            sampled = min(count, _MOST_SAMPLED)
-            for i in range(sampled):
-                values[i] = ordered[starts[cell] + i * count // sampled, 2]
-            medians[cell // columns, cell % columns] = _median(values, sampled)
+    for row in range(rows):
+        for column in range(columns):
+            start = starts[row * columns + column]
+            count = starts[row * columns + column + 1] - start
+            if count:
+                medians[row, column] = _median_of_nine(
+                    ordered[start, 2],
+                    ordered[start + count // 9, 2],
+                    ordered[start + 2 * count // 9, 2],
+                    ordered[start + 3 * count // 9, 2],
+                    ordered[start + 4 * count // 9, 2],
+                    ordered[start + 5 * count // 9, 2],
+                    ordered[start + 6 * count // 9, 2],
+                    ordered[start + 7 * count // 9, 2],
+                    ordered[start + 8 * count // 9, 2],
+                )
     return medians
 
 
@@ -222,16 +191,41 @@ def neighbourhood_medians(values: FloatArray) -> FloatArray:
     result = np.full((rows, columns), np.nan, np.float32)
     around = np.empty(9, np.float32)
     for row in range(rows):
+        if 0 < row < rows - 1:
+            above = values[row - 1]
+            here = values[row]
+            below = values[row + 1]
+            found = result[row]
+            for c in range(1, columns - 1):
+                a, b, d = above[c - 1], above[c], above[c + 1]
+                e, f, g = here[c - 1], here[c], here[c + 1]
+                h, i, j = below[c - 1], below[c], below[c + 1]
+                # The sum times zero: NaN where one of the nine is.
+                missing = np.float32(0) * (a + b + d + e + f + g + h + i + j)
+                found[c] = _median_of_nine(a, b, d, e, f, g, h, i, j) + missing
         for column in range(columns):
-            count = 0
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(column - 1, 0), min(column + 2, columns)):
-                    if not np.isnan(values[r, c]):
-                        around[count] = values[r, c]
-                        count += 1
-            if count:
-                result[row, column] = _median(around, count)
+            if np.isnan(result[row, column]):
+                result[row, column] = _median_of_known(values, row, column, around)
     return result
+
+
+@njit(nogil=True, cache=True)
+def _median_of_known(values: FloatArray, row: int, column: int, around: FloatArray) -> float:
+    """Median of those of the 3 x 3 cells about one that have a value; NaN if none has."""
+    count = 0
+    for r in range(max(row - 1, 0), min(row + 2, values.shape[0])):
+        for c in range(max(column - 1, 0), min(column + 2, values.shape[1])):
+            value = values[r, c]
+            if not np.isnan(value):
+                k = count
+                while k > 0 and around[k - 1] > value:
+                    around[k] = around[k - 1]
+                    k -= 1
+                around[k] = value
+                count += 1
+    if count == 0:
+        return np.nan
+    return 0.5 * (around[(count - 1) // 2] + around[count // 2])
 
 
 @njit(nogil=True, cache=True)
@@ -272,175 +266,262 @@ def cell_scatter(
     along_rows: FloatArray,
     least: float,
 ) -> FloatArray:
-    """Median absolute distance, times 1.4826, of the points of each cell (or a sample) from its seed plane."""
+    """Median absolute distance, times 1.4826, of five points of each cell from its seed plane; NaN without points."""
     rows, columns = seeds.shape
-    values = np.empty(_MOST_SAMPLED, np.float32)
     scatter = np.full((rows, columns), np.nan, np.float32)
     for row in range(rows):
         for column in range(columns):
-            cell = row * columns + column
-            count = starts[cell + 1] - starts[cell]
-            if not count:
-                continue
-            sampled = min(count, _MOST_SAMPLED)
-            for i in range(sampled):
-                n = starts[cell] + i * count // sampled
-                plane = seeds[row, column] + along_columns[row, column] * ordered[n, 0]
-                values[i] = abs(ordered[n, 2] - plane - along_rows[row, column] * ordered[n, 1])
-            scatter[row, column] = max(least, 1.4826 * _median(values, sampled))
+            start = starts[row * columns + column]
+            count = starts[row * columns + column + 1] - start
+            if count:
+                plane = seeds[row, column], along_columns[row, column], along_rows[row, column]
+                median = _median_of_five(
+                    _distance(ordered, start, plane),
+                    _distance(ordered, start + count // 5, plane),
+                    _distance(ordered, start + 2 * count // 5, plane),
+                    _distance(ordered, start + 3 * count // 5, plane),
+                    _distance(ordered, start + 4 * count // 5, plane),
+                )
+                scatter[row, column] = max(least, 1.4826 * median)
     return scatter
 
 
 @njit(nogil=True, cache=True)
-def cell_moments(
+def _distance(ordered: FloatArray, n: int, plane: tuple[float, float, float]) -> float:
+    """Height of a point above or below a plane of (height, slope along columns, slope along rows)."""
+    above: float = ordered[n, 2] - plane[0] - plane[1] * ordered[n, 0] - plane[2] * ordered[n, 1]
+    return abs(above)
+
+
+@njit(nogil=True, cache=True)
+def gate_limits(seeds: FloatArray, medians: FloatArray, scatter: FloatArray, gate: float) -> FloatArray:
+    """How far from its seed plane a point may lie: `gate` scatters plus half the range of the seeds around.
+
+    Only seeds of cells that have points of their own count, which are those with a median.
+    """
+    rows, columns = seeds.shape
+    limits = np.empty((rows, columns), np.float32)
+    lowest = np.empty(columns + 2, np.float32)
+    highest = np.empty(columns + 2, np.float32)
+    for row in range(rows):
+        lowest[:] = np.inf
+        highest[:] = -np.inf
+        low, high = lowest[1:], highest[1:]
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            seeds_here, medians_here = seeds[r], medians[r]
+            for c in range(columns):
+                # NaN, of a cell without points, compares false and changes nothing.
+                seed = seeds_here[c] + np.float32(0) * medians_here[c]
+                low[c] = seed if seed < low[c] else low[c]
+                high[c] = seed if seed > high[c] else high[c]
+        for c in range(columns):
+            span = max(max(highest[c], highest[c + 1]), highest[c + 2])
+            span -= min(min(lowest[c], lowest[c + 1]), lowest[c + 2])
+            limits[row, c] = gate * scatter[row, c] + 0.5 * span
+    return limits
+
+
+# Sums over the points of a cell, in this order: w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, wzz, points, and whether there
+# are any; w is the weight of a point, x and y its place in cells from the cell's centre, z its height.
+_W, _X, _Y, _XX, _XY, _YY, _Z, _XZ, _YZ, _ZZ, _POINTS, _ANY, _WW = range(13)
+_SUMS = 12
+_RUN = 64  # cells of a row whose planes are fitted side by side
+_WIDE = _RUN + 2
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
+def _sum_points(
     ordered: FloatArray,
     starts: IntArray,
     seeds: FloatArray,
     along_columns: FloatArray,
     along_rows: FloatArray,
-    scatter: FloatArray,
-    gate: float,
-) -> FloatArray:
-    """Sums over the points of each cell: w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, wzz, 1.
+    limits: FloatArray,
+    row: int,
+    sums: FloatArray,
+) -> None:
+    """Fill sums (12, columns + 2 and more) with those of the cells of a row; cell c stands at c + 1."""
+    columns = seeds.shape[1]
+    for column in range(columns):
+        cell = row * columns + column
+        if starts[cell + 1] == starts[cell]:
+            for k in range(_SUMS):
+                sums[k, column + 1] = 0.0
+            continue
+        seed = seeds[row, column]
+        slope_x = along_columns[row, column]
+        slope_y = along_rows[row, column]
+        limit = limits[row, column]
+        zero = np.float32(0)
+        sw = sx = sy = sxx = sxy = syy = sz = sxz = syz = szz = points = zero
+        for n in range(starts[cell], starts[cell + 1]):
+            x = ordered[n, 0]
+            y = ordered[n, 1]
+            z = ordered[n, 2] - seed - slope_x * x - slope_y * y
+            kept = abs(z) <= limit
+            w = ordered[n, 3] if kept else zero
+            z = z if kept else zero
+            wx = w * x
+            wy = w * y
+            wz = w * z
+            points += np.float32(1) if kept else zero
+            sw += w
+            sx += wx
+            sy += wy
+            sxx += wx * x
+            sxy += wx * y
+            syy += wy * y
+            sz += wz
+            sxz += wz * x
+            syz += wz * y
+            szz += wz * z
+        # So far z is the distance from the seed plane, which keeps float32 exact enough.
+        up = np.float64(seed)  # float() would leave it as it is
+        a = np.float64(slope_x)
+        b = np.float64(slope_y)
+        squares = szz + 2.0 * (up * sz + a * sxz + b * syz) + up * up * sw + a * a * sxx + b * b * syy
+        sums[_W, column + 1] = sw
+        sums[_X, column + 1] = sx
+        sums[_Y, column + 1] = sy
+        sums[_XX, column + 1] = sxx
+        sums[_XY, column + 1] = sxy
+        sums[_YY, column + 1] = syy
+        sums[_Z, column + 1] = sz + up * sw + a * sx + b * sy
+        sums[_XZ, column + 1] = sxz + up * sx + a * sxx + b * sxy
+        sums[_YZ, column + 1] = syz + up * sy + a * sxy + b * syy
+        sums[_ZZ, column + 1] = squares + 2.0 * (up * (a * sx + b * sy) + a * b * sxy)
+        sums[_POINTS, column + 1] = points
+        sums[_ANY, column + 1] = 1.0 if sw > zero else 0.0
 
-    x and y in cells from the cell's centre, z in metres from its seed, w the point's weight. Points farther from the
-    seed plane than `gate` scatters plus half the range of the seeds around are left out.
-    """
-    rows, columns = seeds.shape
-    moments = np.zeros((rows, columns, 11))
-    for row in range(rows):
-        for column in range(columns):
-            cell = row * columns + column
-            if starts[cell + 1] == starts[cell]:
-                continue
-            seed = seeds[row, column]
-            lowest = seed
-            highest = seed
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(column - 1, 0), min(column + 2, columns)):
-                    if starts[r * columns + c + 1] > starts[r * columns + c]:
-                        lowest = min(lowest, seeds[r, c])
-                        highest = max(highest, seeds[r, c])
-            limit = gate * scatter[row, column] + 0.5 * (highest - lowest)
-            slope_x = along_columns[row, column]
-            slope_y = along_rows[row, column]
-            sw = sx = sy = sxx = sxy = syy = sz = sxz = syz = szz = count = 0.0
-            for n in range(starts[cell], starts[cell + 1]):
-                x = float(ordered[n, 0])
-                y = float(ordered[n, 1])
-                z = float(ordered[n, 2]) - seed
-                if abs(z - slope_x * x - slope_y * y) > limit:
-                    continue
-                w = float(ordered[n, 3])
-                wx = w * x
-                wy = w * y
-                wz = w * z
-                count += 1.0
-                sw += w
-                sx += wx
-                sy += wy
-                sxx += wx * x
-                sxy += wx * y
-                syy += wy * y
-                sz += wz
-                sxz += wz * x
-                syz += wz * y
-                szz += wz * z
-            for k, total in enumerate((sw, sx, sy, sxx, sxy, syy, sz, sxz, syz, szz, count)):
-                moments[row, column, k] = total
-    return moments
+
+@njit(nogil=True, cache=True)
+def _add_rows(above: FloatArray, here: FloatArray, below: FloatArray, start: int, side: float, to: FloatArray) -> None:
+    """Sums of three rows of cells as seen from the middle one, the others with less weight, for a run of columns."""
+    for k in range(_SUMS):
+        first = above[k, start : start + _WIDE]
+        second = here[k, start : start + _WIDE]
+        third = below[k, start : start + _WIDE]
+        weight = 1.0 if k == _ANY else side
+        for t in range(_WIDE):
+            to[k * _WIDE + t] = second[t] + weight * (first[t] + third[t])
+    for t in range(_WIDE):
+        to[_WW * _WIDE + t] = here[_W, start + t] + side * side * (above[_W, start + t] + below[_W, start + t])
+    # y counts from the middle row: one less above, one more below.
+    for k, lower in ((_Y, _W), (_XY, _X), (_YZ, _Z)):
+        first = above[lower, start : start + _WIDE]
+        third = below[lower, start : start + _WIDE]
+        for t in range(_WIDE):
+            to[k * _WIDE + t] += side * (third[t] - first[t])
+    for t in range(_WIDE):
+        first_y = above[_W, start + t] - 2.0 * above[_Y, start + t]
+        third_y = below[_W, start + t] + 2.0 * below[_Y, start + t]
+        to[_YY * _WIDE + t] += side * (first_y + third_y)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def local_planes(
-    moments: FloatArray,
+    ordered: FloatArray,
+    starts: IntArray,
     seeds: FloatArray,
     along_columns: FloatArray,
     along_rows: FloatArray,
+    limits: FloatArray,
     side_weight: float,
     slope_weight: float,
     neighbours_to_fill: int,
     per_independent: float,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Height at each cell's centre of the plane fitted to the points of its 3 x 3 cells.
 
-    The four cells beside weigh `side_weight`, the corners its square. `slope_weight` points at the distance of a cell
-    say that the slope is that of the seeds. Also returns the standard deviation of a point of weight one about the
-    plane, and the number of such independent points that all amount to, where so many as `per_independent` count as
-    one, but never less than a single point of theirs.
+    Points farther from their cell's seed plane than its limit are left out. The four cells beside weigh `side_weight`,
+    the corners its square. `slope_weight` points at the distance of a cell say that the slope is that of the seeds.
+    Also returns the standard deviation of a point of weight one about the plane, the number of such independent points
+    that all amount to, where so many as `per_independent` count as one, but never less than a single point of theirs,
+    and the points of the cell itself.
     """
     rows, columns = seeds.shape
     heights = np.full((rows, columns), np.nan, np.float32)
     deviations = np.full((rows, columns), np.nan, np.float32)
     independent = np.ones((rows, columns), np.float32)
+    counts = np.zeros((rows, columns), np.int32)
+    # Sums of three rows at a time, with an empty cell on either side.
+    ring = np.zeros((3, _SUMS, (columns + _RUN - 1) // _RUN * _RUN + 2))
+    lines = np.zeros((_WW + 1) * _WIDE)
+    slopes = np.zeros(2 * _RUN)
+    solved = np.zeros(3 * _RUN)
+    if rows:
+        _sum_points(ordered, starts, seeds, along_columns, along_rows, limits, 0, ring[0])
     for row in range(rows):
-        for column in range(columns):
-            seed = seeds[row, column]
-            if np.isnan(seed):
-                continue
-            filled = 0
-            sw = 0.0
-            sww = 0.0
-            sn = 0.0
-            sx = 0.0
-            sy = 0.0
-            sxx = 0.0
-            sxy = 0.0
-            syy = 0.0
-            sz = 0.0
-            sxz = 0.0
-            syz = 0.0
-            szz = 0.0
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(column - 1, 0), min(column + 2, columns)):
-                    m = moments[r, c]
-                    if m[0] == 0.0:
-                        continue
-                    filled += 1
-                    dx = float(c - column)
-                    dy = float(r - row)
-                    up = seeds[r, c] - seed
-                    w = 1.0 if c == column else side_weight
-                    if r != row:
-                        w *= side_weight
-                    x = m[1] + dx * m[0]
-                    y = m[2] + dy * m[0]
-                    z = m[6] + up * m[0]
-                    sw += w * m[0]
-                    sww += w * w * m[0]
-                    sn += w * m[10]
-                    sx += w * x
-                    sy += w * y
-                    sxx += w * (m[3] + dx * (m[1] + x))
-                    sxy += w * (m[4] + dx * m[2] + dy * x)
-                    syy += w * (m[5] + dy * (m[2] + y))
-                    sz += w * z
-                    sxz += w * (m[7] + dx * m[6] + up * x)
-                    syz += w * (m[8] + dy * m[6] + up * y)
-                    szz += w * (m[9] + up * (m[6] + z))
-            if filled == 0 or (moments[row, column, 0] == 0.0 and filled < neighbours_to_fill):
-                continue
-            # Cramer on the 3 x 3 normal equations of height and two slopes.
-            pxx = sxx + slope_weight
-            pyy = syy + slope_weight
-            pxz = sxz + slope_weight * along_columns[row, column]
-            pyz = syz + slope_weight * along_rows[row, column]
-            k00 = pxx * pyy - sxy * sxy
-            k01 = sxy * sy - sx * pyy
-            k02 = sx * sxy - pxx * sy
-            k11 = sw * pyy - sy * sy
-            k12 = sx * sy - sw * sxy
-            k22 = sw * pxx - sx * sx
-            scale = 1.0 / (sw * k00 + sx * k01 + sy * k02)
-            a = (k00 * sz + k01 * pxz + k02 * pyz) * scale
-            b = (k01 * sz + k11 * pxz + k12 * pyz) * scale
-            d = (k02 * sz + k12 * pxz + k22 * pyz) * scale
-            squares = szz - 2.0 * (a * sz + b * sxz + d * syz) + a * a * sw + b * b * sxx + d * d * syy
-            squares += 2.0 * (a * b * sx + a * d * sy + b * d * sxy)
-            heights[row, column] = seed + a
-            deviations[row, column] = math.sqrt(max(squares, 0.0) / sw)
-            independent[row, column] = max(sw * sw / sww / per_independent, sw / sn)
-    return heights, deviations, independent
+        above, here, below = ring[(row + 2) % 3], ring[row % 3], ring[(row + 1) % 3]
+        if row + 1 < rows:
+            _sum_points(ordered, starts, seeds, along_columns, along_rows, limits, row + 1, below)
+        else:
+            below[:] = 0.0
+        for start in range(0, columns, _RUN):
+            count = min(_RUN, columns - start)
+            _add_rows(above, here, below, start, side_weight, lines)
+            for t in range(count):
+                slopes[t] = along_columns[row, start + t]
+                slopes[_RUN + t] = along_rows[row, start + t]
+            _solve_run(lines, slopes, side_weight, slope_weight, solved)
+            for t in range(count):
+                own = here[_ANY, start + 1 + t] > 0.0
+                around = (_ANY * _WIDE) + t
+                filled = lines[around] + lines[around + 1] + lines[around + 2]
+                if own or filled >= neighbours_to_fill:
+                    heights[row, start + t] = solved[t]
+                    deviations[row, start + t] = solved[_RUN + t]
+                    amount = solved[2 * _RUN + t] / per_independent
+                    sw = _sum_columns(lines, _W, t, side_weight)
+                    independent[row, start + t] = max(amount, sw / _sum_columns(lines, _POINTS, t, side_weight))
+                    counts[row, start + t] = int(here[_POINTS, start + 1 + t])
+    return heights, deviations, independent, counts
+
+
+@njit(nogil=True, cache=True)
+def _sum_columns(lines: FloatArray, k: int, t: int, side: float) -> float:
+    """Sum over the three columns about the t-th cell of a run, of sums over three rows."""
+    total: float = lines[k * _WIDE + t + 1] + side * (lines[k * _WIDE + t] + lines[k * _WIDE + t + 2])
+    return total
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def _solve_run(lines: FloatArray, slopes: FloatArray, side: float, slope_weight: float, solved: FloatArray) -> None:
+    """Fit the planes of a run of cells: (height, deviation, independent points), a line of `_RUN` each."""
+    for t in range(_RUN):
+        sw = _sum_columns(lines, _W, t, side)
+        sww = _sum_columns(lines, _WW, t, side * side)
+        syy = _sum_columns(lines, _YY, t, side)
+        sy = _sum_columns(lines, _Y, t, side)
+        sz = _sum_columns(lines, _Z, t, side)
+        syz = _sum_columns(lines, _YZ, t, side)
+        szz = _sum_columns(lines, _ZZ, t, side)
+        # x counts from the middle column: one less before, one more after.
+        sx = _sum_columns(lines, _X, t, side) + side * (lines[_W * _WIDE + t + 2] - lines[_W * _WIDE + t])
+        sxy = _sum_columns(lines, _XY, t, side) + side * (lines[_Y * _WIDE + t + 2] - lines[_Y * _WIDE + t])
+        sxz = _sum_columns(lines, _XZ, t, side) + side * (lines[_Z * _WIDE + t + 2] - lines[_Z * _WIDE + t])
+        sxx = _sum_columns(lines, _XX, t, side) + side * (lines[_W * _WIDE + t + 2] + lines[_W * _WIDE + t])
+        sxx += 2.0 * side * (lines[_X * _WIDE + t + 2] - lines[_X * _WIDE + t])
+        # Cramer on the 3 x 3 normal equations of height and two slopes.
+        pxx = sxx + slope_weight
+        pyy = syy + slope_weight
+        pxz = sxz + slope_weight * slopes[t]
+        pyz = syz + slope_weight * slopes[_RUN + t]
+        k00 = pxx * pyy - sxy * sxy
+        k01 = sxy * sy - sx * pyy
+        k02 = sx * sxy - pxx * sy
+        k11 = sw * pyy - sy * sy
+        k12 = sx * sy - sw * sxy
+        k22 = sw * pxx - sx * sx
+        scale = 1.0 / (sw * k00 + sx * k01 + sy * k02)
+        a = (k00 * sz + k01 * pxz + k02 * pyz) * scale
+        b = (k01 * sz + k11 * pxz + k12 * pyz) * scale
+        d = (k02 * sz + k12 * pxz + k22 * pyz) * scale
+        squares = szz - 2.0 * (a * sz + b * sxz + d * syz) + a * a * sw + b * b * sxx + d * d * syy
+        squares += 2.0 * (a * b * sx + a * d * sy + b * d * sxy)
+        solved[t] = a
+        solved[_RUN + t] = math.sqrt(max(squares, 0.0) / sw)
+        solved[2 * _RUN + t] = sw * sw / sww
 
 
 @njit(nogil=True, cache=True)

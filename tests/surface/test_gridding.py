@@ -39,6 +39,28 @@ def test_a_steep_plane_is_recovered_however_unevenly_the_points_lie(rng):
     assert np.abs(error).max() < 0.5
 
 
+@pytest.mark.parametrize("height_m", [0.0, 8000.0])
+def test_each_height_is_that_of_the_weighted_plane_through_its_nine_cells(rng, height_m):
+    points = scattered(rng, count=60_000)
+    points[:, 2] += height_m + rng.normal(0, 3.0, len(points))
+    weights = rng.uniform(0.2, 1.0, len(points)).astype(np.float32)
+    found = grid_points(points, GRID, **CHOICES, weights=weights)
+    # More columns than are fitted side by side in one go; cells on both sides of the seam.
+    for row, column in ((5, 7), (20, 31), (20, 32), (44, 57), (30, 1), (1, 30)):
+        x, y = GRID.pixels(points[:, :2])[::-1]
+        cells = np.rint(x) - column, np.rint(y) - row
+        near = (np.abs(cells[0]) <= 1) & (np.abs(cells[1]) <= 1)
+        spatial = np.exp(-(cells[0] ** 2 + cells[1] ** 2)[near] / (2 * 0.5**2))
+        root = np.sqrt(spatial * weights[near])
+        design = np.column_stack([np.ones(near.sum()), x[near] - column, y[near] - row])
+        solution = np.linalg.lstsq(design * root[:, None], points[near, 2] * root)[0]
+        residual = np.sqrt(np.sum((root * (points[near, 2] - design @ solution)) ** 2) / np.sum(root**2))
+        assert found.height_m[row, column] == pytest.approx(solution[0], abs=0.02)
+        independent = np.sum(root**2) ** 2 / np.sum(root**4 / weights[near])
+        assert found.sigma_m[row, column] == pytest.approx(max(residual, 1.5) / np.sqrt(independent), rel=1e-3)
+        assert found.count[row, column] == ((cells[0] == 0) & (cells[1] == 0)).sum()
+
+
 def test_gross_errors_leave_no_trace_up_to_a_fifth_of_the_points(rng):
     points = scattered(rng)
     points[:, 2] += rng.normal(0, 1.5, len(points))
