@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter
 
+from cosp.io import rasters
+from cosp.matching.ground import lattice_rc
+from cosp.matching.matchers import structural
 from cosp.matching.redundancy import sigma_factor
 
 TEMPLATE = 2.0
@@ -46,3 +49,19 @@ def test_nothing_is_said_of_matches_that_stand_alone():
     film_mm = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1).reshape(-1, 2) * 5
     assert sigma_factor(film_mm, np.zeros((400, 2)), np.ones(400), TEMPLATE) is None
     assert sigma_factor(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), TEMPLATE) is None
+
+
+@pytest.mark.parametrize("band", [3, 5])
+def test_neighbours_in_real_images_tell_what_distant_matches_confirm(real_data, band):
+    july, november = (
+        rasters.read(real_data / "pennsylvania" / f"landsat7_2002{day}_b123457.tif", band).astype(np.float32)
+        for day in ("0720", "1125")
+    )
+    found = structural(65, 14, 0.3, 0.9, 1.0).match(july, november, lattice_rc(july.shape, 16, 46), threads=1)
+    off = found.fixed_rc - found.moving_rc
+    right = np.linalg.norm(off, axis=1) < 3.0
+    places, off, sigma = found.moving_rc[right], off[right], found.sigma_px[right]
+    first, second = np.triu_indices(len(off), 1)
+    apart = np.abs(places[first] - places[second]).max(axis=1) >= 65.0
+    difference = (off[first] - off[second])[apart] / np.hypot(sigma[first], sigma[second])[apart, None]
+    assert sigma_factor(places, off, sigma, 65.0) == pytest.approx(1.4826 * np.median(np.abs(difference)), rel=0.3)
