@@ -12,12 +12,16 @@ from cosp.matching.redundancy import sigma_factor
 TEMPLATE = 2.0
 
 
-def overlapping_matches(rng, sigma_mm, *, side=300, step=0.1):
-    """Points every fifth of a template; errors are means of white noise over the template, as those of matches are."""
+def overlapping_matches(rng, sigma_mm, *, side=600, step=0.1):
+    """Four points in every tile, half a template apart, tiles two templates apart.
+
+    Errors are means of white noise over the template, as those of matches are.
+    """
     box = round(TEMPLATE / step)
     noise = rng.standard_normal((side, side, 2))
     error = np.stack([uniform_filter(noise[..., i], box, mode="wrap") for i in (0, 1)], axis=-1) * box * sigma_mm
-    rows, columns = (v.ravel() for v in np.mgrid[0 : side : box // 5, 0 : side : box // 5])
+    places = np.add.outer(np.arange(0, side - box, 2 * box), [0, box // 2]).ravel()
+    rows, columns = (v.ravel() for v in np.meshgrid(places, places, indexing="ij"))
     return np.column_stack([columns, rows]) * step, error[rows, columns]
 
 
@@ -32,7 +36,7 @@ def test_errors_of_overlapping_templates_are_found_whatever_was_stated(truth):
 def test_what_neighbours_share_and_single_errors_do_not_count():
     rng = np.random.default_rng(2)
     film_mm, error = overlapping_matches(rng, 0.02)
-    waves = 0.5 * np.stack([np.sin(film_mm[:, 1] / 40), np.cos(film_mm[:, 0] / 40)], axis=-1)
+    waves = 0.5 * np.stack([np.sin(film_mm[:, 1] / 80), np.cos(film_mm[:, 0] / 80)], axis=-1)
     error[rng.choice(len(error), len(error) // 20, replace=False)] += 3.0
     factor = sigma_factor(film_mm, error + waves + [1.0, -2.0], np.full(len(error), 0.02), TEMPLATE)
     assert factor == pytest.approx(1.0, abs=0.25)
@@ -41,7 +45,7 @@ def test_what_neighbours_share_and_single_errors_do_not_count():
 def test_better_and_worse_matches_keep_their_proportion():
     rng = np.random.default_rng(3)
     film_mm, error = overlapping_matches(rng, 1.0)
-    sigma = np.where(film_mm[:, 0] < 15.0, 0.01, 0.05)
+    sigma = np.where(film_mm[:, 0] < 30.0, 0.01, 0.05)
     assert sigma_factor(film_mm, error * sigma[:, None], 2 * sigma, TEMPLATE) == pytest.approx(0.5, rel=0.1)
 
 
