@@ -11,7 +11,7 @@ import numpy as np
 
 from cosp.arrays import ByteArray
 from cosp.errors import StitchingError
-from cosp.film.stitching import CoarseSeam, Features, find_features, match_features, turned_features
+from cosp.film.stitching import CoarseSeam, Features, find_features, match_features, match_patches, turned_features
 
 _LOG = logging.getLogger(__name__)
 
@@ -157,6 +157,8 @@ def _margin(seam: CoarseSeam) -> float:
 
 # Keypoints per part while all orders and poses are compared.
 _SKETCH_KEYPOINTS = 3000
+# Side of a patch that looks for its place in the other part.
+_PATCH_MM = 4.0
 # Two pieces of film can be joined in eight ways.
 _MOST_CHAINS = 12
 
@@ -209,7 +211,7 @@ class _Evidence:
         return self._sketches[left, right]
 
     def closer(self, left: _Placed, right: _Placed) -> CoarseSeam | None:
-        """The seam from keypoints of half the size, then of a quarter."""
+        """The seam from keypoints of half the size, then of a quarter, then from patches all over the overlap."""
         best = self.seam(left, right)
         factor = self._factor
         while factor > max(1, self._factor // 4):
@@ -218,8 +220,18 @@ class _Evidence:
             if finer is not None and (best is None or finer.inliers > best.inliers):
                 best = finer
             if self._limits.accepts(best):
-                break
-        return best
+                return best
+        low, high = self._limits.overlap_mm
+        by_patches = match_patches(
+            *(posed(self._parts[index], pose) for index, pose in (left, right)),
+            factor=self._factor,
+            patch_px=round(_PATCH_MM / self._pixel_mm),
+            overlap_px=(low / self._pixel_mm, high / self._pixel_mm),
+            offset_px=self._limits.offset_mm / self._pixel_mm,
+            gate_px=2.0 * self._factor,
+            rng=self._rng,
+        )
+        return by_patches if self._limits.accepts(by_patches) else best
 
     def _match(self, left: _Placed, right: _Placed, factor: int, strongest: int | None = None) -> CoarseSeam | None:
         low, high = self._limits.overlap_mm

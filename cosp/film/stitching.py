@@ -31,6 +31,8 @@ _ROTATION_LIMIT_DEG = 1.2
 # Half width of a patch's search window while the motion is still coarse, and once it is nearly right.
 _SEARCH_PX = (12, 5, 3)
 _PATCHES = 600
+_RIVAL_PATCH = 0.85  # height of the next peak over that of the first: more is chance
+_PATCH_COLUMNS = 6  # of the patches that look for an overlap: the narrowest may hold the first only
 # Farther than this from the common motion a patch is a blunder (dust, scratches, repeated pattern).
 GATE_PX = 1.5
 _RESIDUALS_KEPT = 250
@@ -165,6 +167,86 @@ def match_features(
     reach = overlap_px[1] + gate_px
     left, right = left.where(left.xy[:, 0] > left_width_px - reach), right.where(right.xy[:, 0] < reach)
     source, target = _mutual_matches(left, right, ratio=ratio)
+    return _agreed(
+        source,
+        target,
+        left_width_px=left_width_px,
+        overlap_px=overlap_px,
+        offset_px=offset_px,
+        gate_px=gate_px,
+        rng=rng,
+    )
+
+
+def match_patches(
+    left: ByteArray,
+    right: ByteArray,
+    *,
+    factor: int,
+    patch_px: int,
+    overlap_px: tuple[float, float],
+    offset_px: float,
+    gate_px: float,
+    rng: np.random.Generator,
+) -> CoarseSeam | None:
+    """Motion from the right part into the left part that most patches of the right one's beginning vote for.
+
+    A patch uses all of its pixels: it finds its place in ground, such as sea, that has no keypoint. Dearer than
+    `match_features`, whose parameters these are but for
+
+    Parameters
+    ----------
+    factor : int
+        Pixels of the parts per pixel that is looked at.
+    patch_px : int
+        Side of a patch.
+    """
+    width = int(min(overlap_px[1], left.shape[1]))
+    first = left.shape[1] - width
+    target_image = block_mean(np.ascontiguousarray(left[:, first:]), factor)
+    source_image = block_mean(np.ascontiguousarray(right[:, :width]), factor)
+    size, offset = patch_px // factor, int(np.ceil(offset_px / factor))
+    padded = np.pad(target_image, ((offset, offset), (0, 0)), mode="edge")
+    rows = np.arange(0, source_image.shape[0] - size, size)
+    rows = rows[rows + size <= target_image.shape[0]]
+    columns = size // 4 + size * np.arange(_PATCH_COLUMNS)
+    columns = columns[columns + size <= source_image.shape[1]]
+    source, target = [], []
+    for row in rows:
+        templates = np.stack([source_image[row : row + size, c : c + size] for c in columns]).astype(np.float32)
+        band = padded[row : row + size + 2 * offset].astype(np.float32)
+        surfaces = ncc_surfaces(templates, np.broadcast_to(band, (len(columns), *band.shape)))
+        shift, _, rival = subpixel_peaks(surfaces)
+        sure = (rival < _RIVAL_PATCH) & np.isfinite(shift).all(axis=1)
+        source.append(np.column_stack([columns, np.full(len(columns), row)])[sure])
+        centre = (np.array(surfaces.shape[:0:-1]) - 1) / 2
+        target.append((shift[:, ::-1] + centre + (0.0, row - offset))[sure])
+    if not source:
+        return None
+    # The middle of a patch, in pixels of the parts.
+    middle = (np.array([size, size]) * factor - 1) / 2
+    return _agreed(
+        np.concatenate(source) * factor + middle,
+        np.concatenate(target) * factor + middle + (first, 0.0),
+        left_width_px=left.shape[1],
+        overlap_px=overlap_px,
+        offset_px=offset_px,
+        gate_px=gate_px,
+        rng=rng,
+    )
+
+
+def _agreed(
+    source: FloatArray,
+    target: FloatArray,
+    *,
+    left_width_px: int,
+    overlap_px: tuple[float, float],
+    offset_px: float,
+    gate_px: float,
+    rng: np.random.Generator,
+) -> CoarseSeam | None:
+    """The plausible motion from places (N, 2) of the right part to those of the left one that most agree on."""
     shift = target - source
     overlap = left_width_px - shift[:, 0]
     plausible = (overlap > overlap_px[0]) & (overlap < overlap_px[1]) & (np.abs(shift[:, 1]) < offset_px)

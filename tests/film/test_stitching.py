@@ -12,11 +12,19 @@ from cosp.arrays import ByteArray
 from cosp.errors import InputError, StitchingError
 from cosp.film.arrangement import Arrangement, SeamLimits, arrange, posed
 from cosp.film.joining import Layout, compose, compose_reduced, lay_out
-from cosp.film.stitching import Seam, correlate_patches, refine_seam, require_part
+from cosp.film.stitching import (
+    Seam,
+    correlate_patches,
+    find_features,
+    match_features,
+    match_patches,
+    refine_seam,
+    require_part,
+)
 from cosp.geometry.transforms import Rigid
 from cosp.imaging.resampling import block_mean, sample
 from cosp.imaging.windows import Window
-from tests.film.synthetic import Film, cut, make_film
+from tests.film.synthetic import Film, cut, make_film, texture
 
 LIMITS = SeamLimits(
     overlap_mm=(5, 120), offset_mm=10, feature_pixel_mm=0.28, ratio=0.85, min_features=15, min_margin=2.0
@@ -185,6 +193,34 @@ def test_two_pieces_that_a_nearly_blank_overlap_joins_are_put_in_order(film):
         assert_array_equal(found, expected)
     seam = _seams(shuffled, arrangement)[0]
     assert _worst_px(seam.motion, motions[0].inverse().after(motions[1]), parts[0].shape, seam.overlap_px) < 0.3
+
+
+def test_patches_find_the_place_of_ground_without_keypoints():
+    """Sea: one grey level of texture under two of noise."""
+    rng = np.random.default_rng(12)
+    sea = 90 + 5 * (texture((660, 1500), rng) - 0.5)
+    truth = Rigid(0.004, (880.3, 9.6))
+    columns, rows = np.meshgrid(np.arange(620.0), np.arange(600.0))
+    place = truth.apply(np.stack([columns, rows], axis=-1))
+    left, right, other = (
+        np.rint(image + rng.normal(0, 2.0, image.shape)).astype(np.uint8)
+        for image in (
+            sea[:600, :1000].astype(np.float32),
+            sample(sea.astype(np.float32), place[..., 1], place[..., 0]),
+            90 + 5 * (texture((600, 620), rng).astype(np.float32) - 0.5),
+        )
+    )
+    wanted = {"overlap_px": (35.0, 850.0), "offset_px": 60.0, "gate_px": 4.0, "rng": np.random.default_rng(0)}
+    features = [find_features(part, factor=1) for part in (left, right)]
+    by_keypoints = match_features(*features, left_width_px=1000, ratio=0.85, **wanted)
+    assert by_keypoints is None or by_keypoints.inliers < 12
+    by_patches = match_patches(left, right, factor=2, patch_px=48, **wanted)
+    assert by_patches is not None
+    assert by_patches.inliers > 15 > 5 * by_patches.rivals
+    corners = np.array([[0.0, 0.0], [110.0, 0.0], [0.0, 590.0], [110.0, 590.0]])
+    assert_allclose(by_patches.motion.apply(corners), truth.apply(corners), atol=1.5)
+    unrelated = match_patches(left, other, factor=2, patch_px=48, **wanted)
+    assert unrelated is None or unrelated.inliers < 12
 
 
 @pytest.mark.slow
