@@ -19,7 +19,7 @@ import yaml
 from numpy.typing import NDArray
 
 from cosp import sheets
-from cosp.errors import InputError
+from cosp.errors import InputError, StitchingError
 from cosp.geometry.grids import PixelGrid
 from cosp.io import rasters
 
@@ -109,6 +109,21 @@ def test_a_missing_part_is_named_with_its_scene(tmp_path: Path) -> None:
 def test_a_wrong_pixel_size_is_asked_about(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is pixel_um right"):
         _stitch(tmp_path, _parts(tmp_path / "scans"), pixel_um=7.0)
+
+
+def test_four_copies_of_one_part_are_named(tmp_path: Path) -> None:
+    paths = _parts(tmp_path / "scans")
+    for path in paths[1:]:
+        path.write_bytes(paths[0].read_bytes())
+    with pytest.raises(StitchingError, match=rf"{SCENE}_a\.tif and {SCENE}_b\.tif are the same picture"):
+        _stitch(tmp_path, paths)
+
+
+def test_parts_that_do_not_join_are_named(tmp_path: Path) -> None:
+    seam = rf"seam {SCENE}_[a-d]\.tif - {SCENE}_[a-d]\.tif: .*may not belong to one film"
+    with pytest.raises(StitchingError, match=seam) as problem:
+        _stitch(tmp_path, _parts(tmp_path / "scans"))
+    assert "\n" not in str(problem.value)
 
 
 @pytest.mark.slow
