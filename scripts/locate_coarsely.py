@@ -10,7 +10,7 @@ from cosp.io.logs import log_to
 from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Attempt
 from cosp.matching.ground import map_crs
-from cosp.matching.placement import locate_film
+from cosp.matching.placement import SearchLimits, locate_film
 from cosp.report import figures
 from cosp.report.placement import draw_placement
 
@@ -26,13 +26,7 @@ def locate_coarsely(
     day,
     reference_dem_heights,
     search_km,
-    coarse_posting_m,
-    fine_posting_m,
-    min_score,
-    min_margin,
-    min_agreeing,
-    min_agreeing_share,
-    min_block_share,
+    limits,
     seed,
     threads,
 ):
@@ -47,13 +41,7 @@ def locate_coarsely(
         day=date.fromisoformat(day) if day else None,
         crs=crs,
         search_m=1000.0 * search_km,
-        coarse_posting_m=coarse_posting_m,
-        fine_posting_m=fine_posting_m,
-        min_score=min_score,
-        min_margin=min_margin,
-        min_agreeing=min_agreeing,
-        min_agreeing_share=min_agreeing_share,
-        min_block_share=min_block_share,
+        limits=limits,
         rng=np.random.default_rng(seed),
         threads=threads,
     )
@@ -73,13 +61,7 @@ if __name__ == "__main__":
             day=snakemake.params.day,
             reference_dem_heights=snakemake.params.reference_dem_heights,
             search_km=snakemake.params.search_km,
-            coarse_posting_m=snakemake.params.coarse_posting_m,
-            fine_posting_m=snakemake.params.fine_posting_m,
-            min_score=snakemake.params.min_score,
-            min_margin=snakemake.params.min_margin,
-            min_agreeing=snakemake.params.min_agreeing,
-            min_agreeing_share=snakemake.params.min_agreeing_share,
-            min_block_share=snakemake.params.min_block_share,
+            limits=SearchLimits.of(snakemake.params),
             seed=snakemake.params.seed,
             threads=snakemake.threads,
         )

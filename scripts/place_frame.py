@@ -14,7 +14,7 @@ from cosp.matching.film_image import FilmImage
 from cosp.matching.footprint import Attempt
 from cosp.matching.ground import Terrain, grown, map_bounds, map_crs
 from cosp.matching.neighbours import PlacedFrame, expected_frame
-from cosp.matching.placement import locate_film, score_in_window, shift_m
+from cosp.matching.placement import SearchLimits, locate_film, shift_m
 from cosp.sheets import parse_scene_id
 
 
@@ -61,13 +61,7 @@ def placed_by_neighbours(
     day,
     reference_dem_heights,
     search_km,
-    coarse_posting_m,
-    fine_posting_m,
-    min_score,
-    min_margin,
-    min_agreeing,
-    min_agreeing_share,
-    min_block_share,
+    limits,
     seed,
     threads,
 ):
@@ -77,7 +71,7 @@ def placed_by_neighbours(
     expected = neighbours_say(camera, [records.read(path, Attempt) for path in others_paths])
     if expected is None:
         raise PlacementError(f"{attempt.refusal}; no other frame of its pass has been placed to say where it must lie")
-    window_m = max(3.0 * expected.sigma_m, 10 * coarse_posting_m)
+    window_m = max(3.0 * expected.sigma_m, 10 * limits.coarse_posting_m)
     log.info("%s; %s place it to %.0f m", attempt.refusal, ", ".join(expected.neighbours), expected.sigma_m)
     crs = map_crs(expected.camera)
     heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
@@ -89,13 +83,7 @@ def placed_by_neighbours(
         day=date.fromisoformat(day) if day else None,
         crs=crs,
         search_m=window_m,
-        coarse_posting_m=coarse_posting_m,
-        fine_posting_m=fine_posting_m,
-        min_score=score_in_window(min_score, 1000.0 * search_km, window_m),
-        min_margin=min_margin,
-        min_agreeing=min_agreeing,
-        min_agreeing_share=min_agreeing_share,
-        min_block_share=min_block_share,
+        limits=limits.in_window(1000.0 * search_km, window_m),
         rng=np.random.default_rng(seed),
         threads=threads,
     )
@@ -134,13 +122,7 @@ if __name__ == "__main__":
             day=snakemake.params.day,
             reference_dem_heights=snakemake.params.reference_dem_heights,
             search_km=snakemake.params.search_km,
-            coarse_posting_m=snakemake.params.coarse_posting_m,
-            fine_posting_m=snakemake.params.fine_posting_m,
-            min_score=snakemake.params.min_score,
-            min_margin=snakemake.params.min_margin,
-            min_agreeing=snakemake.params.min_agreeing,
-            min_agreeing_share=snakemake.params.min_agreeing_share,
-            min_block_share=snakemake.params.min_block_share,
+            limits=SearchLimits.of(snakemake.params),
             seed=snakemake.params.seed,
             threads=snakemake.threads,
         )

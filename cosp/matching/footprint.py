@@ -40,7 +40,7 @@ class Footprint:
         The film raster lies turned by 180 degrees; the camera's film points are those of the raster with the signs of x
         and y changed.
     score : float
-        Height of the correlation peak of the whole search, in standard deviations of its surroundings.
+        How likely the place is by the first search, as the height of a normal variable above its surroundings.
     margin : float
         Agreeing matches at this place, divided by those that speak for the best other candidate and against this one
         (at least one).
@@ -54,7 +54,7 @@ class Footprint:
         "image", "relief", or "neighbours" where nothing but the neighbours speaks for the place: score, margin and
         agreeing share are 0 then.
     sun_azimuth_deg : float
-        Of the shaded relief; meaningless for an image.
+        Of the shaded relief that the film matches best; meaningless for an image.
     corners_lonlat : four (longitude, latitude), degrees
         Of the picture at the mean height: (-x, +y), (+x, +y), (+x, -y), (-x, -y).
     blocks : tuple of FilmBlock
@@ -62,13 +62,13 @@ class Footprint:
         The film raster lies mirrored across its length; the camera's film points are those of the raster with the sign
         of y changed, besides what `turned` says.
     rival_score : float
-        Height of the best other peak of the whole search.
+        That of the best other place.
     rotation_deg, scale : float
         Heading (counter-clockwise) and size on the ground of what was found, against the prediction.
     sun_elevation_deg : float
         Of the shaded relief.
     sigma_m : float
-        Standard deviation of the place on the ground, per coordinate.
+        Standard deviation of the place on the ground, per coordinate, where the film is known worst.
     neighbours : tuple of str
         Frames of the same pass that say where this one is to be looked for, where it could not be placed by itself.
     """

@@ -11,9 +11,8 @@ import cmath
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import date
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -39,8 +38,8 @@ from cosp.matching.ground import (
     reduction_for,
 )
 from cosp.matching.matchers import structural
-from cosp.matching.refit import refit_camera
-from cosp.matching.relief import Sun, relief_reference, suns
+from cosp.matching.refit import refit_camera, refit_sigma_mm
+from cosp.matching.relief import Sun, convexity_reference, relief_reference, suns
 from cosp.matching.search import (
     BLOCKS,
     NOTHING,
@@ -49,22 +48,22 @@ from cosp.matching.search import (
     Found,
     Prepared,
     ScoreMap,
+    View,
     Way,
-    halved,
-    is_clear,
-    search_widely,
 )
 
 log = logging.getLogger(__name__)
 
-# Candidates followed to a finer posting; others than the first only where they come near it.
-_CANDIDATES = 3
+# Matches are not believed to be better than this.
+_LEAST_ERROR_PX = 0.2
+# Candidates followed to a finer posting; once one is taken, only as many as it takes to know its rivals, and only those
+# that come near it.
+_CANDIDATES = 5
+_RIVALS = 2
 _NEAR_SHARE = 0.7
 _MIN_BLOCKS = 2
-# A peak so many times higher than the least is followed before other suns are tried.
-_CLEAR = 1.5
-# Suns under which the film is looked for again, together with the image or in all headings and scales.
-_LIKELY_SUNS = 2
+# The sun is chosen by every so manieth tile.
+_SUN_TILES = 3
 # One posting to the next.
 _LEVEL_RATIO = 3.5
 _TEMPLATE_PX = 81
@@ -80,8 +79,6 @@ _SURE_SHARE = 0.7
 # A film that lies as its camera says gives so many matches a tile; with fewer it is matched again through the fit.
 _MANY = 5.0
 _PASSES = 3
-# Suns of the first search stand 30 degrees apart.
-_SUN_CHANGE_DEG = 15.0
 
 
 @dataclass(frozen=True)
@@ -99,6 +96,67 @@ class Located:
     footprint: Footprint | None
     refusal: str | None
     maps: tuple[ScoreMap, ...]
+
+
+@dataclass(frozen=True)
+class SearchLimits:
+    """Where a search begins and ends, and what a place needs to be believed.
+
+    Parameters
+    ----------
+    coarse_posting_m, fine_posting_m : float
+        First and last posting; the last is not finer than the film.
+    min_score : float
+        Least height of a place of the whole search above its surroundings, in standard deviations.
+    min_margin : float
+        Least ratio of agreeing matches to those of the best other candidate.
+    min_agreeing, min_agreeing_share : int, float
+        Least number and share of matches that agree with one camera.
+    min_block_share : float
+        Least share of the film's blocks with matches in which most of them agree.
+    """
+
+    coarse_posting_m: float
+    fine_posting_m: float
+    min_score: float
+    min_margin: float
+    min_agreeing: int
+    min_agreeing_share: float
+    min_block_share: float
+
+    @classmethod
+    def of(cls, choices: object) -> SearchLimits:
+        """Those among the attributes of something that has more."""
+        return cls(**{one.name: getattr(choices, one.name) for one in fields(cls)})
+
+    def in_window(self, search_m: float, window_m: float) -> SearchLimits:
+        """The same for a smaller window: chance reaches the least score there as seldom as in the whole one.
+
+        The highest of n independent standard normal values grows as the root of 2 log n.
+        """
+        gain = 4 * math.log(max(search_m / window_m, 1.0))  # twice the log of the ratio of the areas
+        return replace(self, min_score=math.sqrt(max(self.min_score**2 - gain, 0.25 * self.min_score**2)))
+
+    def fault(self, placement: _Placement) -> str | None:
+        """Why the matches do not support a placement; None if they do."""
+        agreeing, count = int(placement.agreeing.sum()), len(placement.agreeing)
+        blocks = [block for block in placement.blocks() if block.matches >= 3]
+        good = sum(block.agreeing >= max(3, 0.5 * self.min_agreeing_share * block.matches) for block in blocks)
+        share = good / len(blocks) if blocks else 0.0
+        if (
+            agreeing >= self.min_agreeing
+            and placement.share >= self.min_agreeing_share
+            and share >= self.min_block_share
+            and good >= _MIN_BLOCKS
+            and placement.places() >= _MIN_PLACES
+        ):
+            return None
+        return (
+            f"{agreeing} of {count} matches at {placement.posting_m:.0f} m agree with one camera, at "
+            f"{placement.places()} places of the film and in {good} of {len(blocks)} blocks; needed are "
+            f"{self.min_agreeing} matches, {self.min_agreeing_share:.0%} of all, at {_MIN_PLACES} places and in "
+            f"{self.min_block_share:.0%} of the blocks"
+        )
 
 
 @dataclass(frozen=True)
@@ -153,6 +211,20 @@ class _Placement:
         cells = np.floor((self.matches.film_mm[self.agreeing] / half + 1) / 2 * [_TILES_ALONG, _TILES_ACROSS])
         return len(np.unique(cells, axis=0))
 
+    def sigma_m(self) -> float:
+        """Standard deviation of the place on the ground where the film is known worst: far from all that agrees."""
+        if not self.agreeing.any():
+            return float("nan")
+        mm_per_m = _film_mm_per_m(self.camera, 0.0)
+        ground = self.camera.origin.local_from_geodetic(self.matches.lonlath(self.crs)[self.agreeing])
+        # Matches of one tile err together.
+        per_place = len(ground) / self.places()
+        error_mm = max(self.residual_m, _LEAST_ERROR_PX * self.posting_m) * mm_per_m * math.sqrt(per_place)
+        film_mm = film_lattice(self.camera.half_length_mm, self.camera.half_width_mm, BLOCKS + 1, 3)
+        seen = self.camera.locate(film_mm, float(self.matches.map_m[self.agreeing, 2].mean()))
+        sigma_mm = refit_sigma_mm(self.camera, ground, np.full(len(ground), error_mm), seen)
+        return float(sigma_mm.max() / mm_per_m)
+
     def blocks(self) -> tuple[FilmBlock, ...]:
         half = self.camera.half_length_mm
         index = np.clip(((self.matches.film_mm[:, 0] + half) / (2 * half) * BLOCKS).astype(int), 0, BLOCKS - 1)
@@ -160,36 +232,6 @@ class _Placement:
         return tuple(
             FilmBlock(float(x), int((index == i).sum()), int((self.agreeing & (index == i)).sum()))
             for i, x in enumerate(centres)
-        )
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """What a placement needs to be believed."""
-
-    min_agreeing: int
-    min_share: float
-    min_block_share: float
-
-    def fault(self, placement: _Placement) -> str | None:
-        """Why the matches do not support a placement; None if they do."""
-        agreeing, count = int(placement.agreeing.sum()), len(placement.agreeing)
-        blocks = [block for block in placement.blocks() if block.matches >= 3]
-        good = sum(block.agreeing >= max(3, 0.5 * self.min_share * block.matches) for block in blocks)
-        share = good / len(blocks) if blocks else 0.0
-        if (
-            agreeing >= self.min_agreeing
-            and placement.share >= self.min_share
-            and share >= self.min_block_share
-            and good >= _MIN_BLOCKS
-            and placement.places() >= _MIN_PLACES
-        ):
-            return None
-        return (
-            f"{agreeing} of {count} matches at {placement.posting_m:.0f} m agree with one camera, at "
-            f"{placement.places()} places of the film and in {good} of {len(blocks)} blocks; needed are "
-            f"{self.min_agreeing} matches, {self.min_share:.0%} of all, at {_MIN_PLACES} places and in "
-            f"{self.min_block_share:.0%} of the blocks"
         )
 
 
@@ -202,13 +244,7 @@ def locate_film(
     day: date | None,
     crs: str,
     search_m: float,
-    coarse_posting_m: float,
-    fine_posting_m: float,
-    min_score: float,
-    min_margin: float,
-    min_agreeing: int,
-    min_agreeing_share: float,
-    min_block_share: float,
+    limits: SearchLimits,
     rng: np.random.Generator,
     threads: int,
 ) -> Located:
@@ -230,43 +266,29 @@ def locate_film(
         Map projection in metres to work in.
     search_m : float
         Largest error of the predicted place, in each direction.
-    coarse_posting_m, fine_posting_m : float
-        First and last posting; the last is not finer than the film.
-    min_score : float
-        Least height of the peak of the whole search above its surroundings, in standard deviations.
-    min_margin : float
-        Least ratio of agreeing matches to those of the best other candidate.
-    min_agreeing, min_agreeing_share : int, float
-        Least number and share of matches that agree with one camera.
-    min_block_share : float
-        Least share of the film's blocks with matches in which most of them agree.
+    limits : SearchLimits
     rng : numpy Generator
     threads : int
     """
     pixel_m = ground_pixel_m(predicted, film.pixel_mm, 0.0)
-    last_m = max(fine_posting_m, pixel_m)
+    last_m = max(limits.fine_posting_m, pixel_m)
     finest = film.reduced(reduction_for(last_m, pixel_m))
     finest_m = pixel_m * finest.pixel_mm / film.pixel_mm
-    last_heights_on = lru_cache(1)(heights_on)  # one grid under many suns
     found, refusal = NOTHING, ""
     try:
-        terrain = Terrain.on(heights_on, grown(map_bounds(predicted, crs), search_m), crs, coarse_posting_m)
+        terrain = Terrain.on(heights_on, grown(map_bounds(predicted, crs), search_m), crs, limits.coarse_posting_m)
         follower = _Follower(
-            finest, finest_m, predicted, terrain, heights_on,
-            _Limits(min_agreeing, min_agreeing_share, min_block_share), rng, threads,
+            finest, finest_m, predicted, terrain, heights_on, suns(day, predicted.origin.latitude_deg),
+            limits, rng, threads,
         )  # fmt: skip
         stages = _stages(
-            finest.reduced(reduction_for(coarse_posting_m, finest_m)),
+            finest.reduced(reduction_for(limits.coarse_posting_m, finest_m)),
             predicted,
             terrain,
             image=None if reference_on is None else _Evidence("image", reference_on),
-            reliefs=[
-                _Evidence("relief", relief_reference(last_heights_on, *sun), sun)
-                for sun in suns(day, predicted.origin.latitude_deg)
-            ],
+            relief=_Evidence("relief", convexity_reference(heights_on)),
             search_m=search_m,
-            posting_m=coarse_posting_m,
-            clear=_CLEAR * min_score,
+            posting_m=limits.coarse_posting_m,
             threads=threads,
         )
         for guesses, found, last in stages:
@@ -274,9 +296,8 @@ def locate_film(
                 log.info("place of the whole search: %s", guess)
             try:
                 footprint = follower.footprint(
-                    guesses, _postings(coarse_posting_m, last_m),
-                    found=found, min_score=min_score, min_margin=min_margin, last=last,
-                )  # fmt: skip
+                    guesses, _postings(limits.coarse_posting_m, last_m), found=found, last=last
+                )
             except PlacementError as doubt:
                 refusal = str(doubt)
                 log.info("%s", refusal)
@@ -288,15 +309,6 @@ def locate_film(
     return Located(None, refusal, found.maps)
 
 
-def score_in_window(min_score: float, search_m: float, window_m: float) -> float:
-    """The score that chance reaches as seldom in a smaller window as `min_score` in the whole one.
-
-    The highest of n independent standard normal values grows as the root of 2 log n.
-    """
-    gain = 4 * math.log(max(search_m / window_m, 1.0))  # twice the log of the ratio of the areas
-    return math.sqrt(max(min_score**2 - gain, 0.25 * min_score**2))
-
-
 @dataclass(frozen=True)
 class _Follower:
     """Follows places of the first search to finer postings."""
@@ -306,7 +318,8 @@ class _Follower:
     predicted: PanoramicCamera
     terrain: Terrain
     heights_on: OnGrid
-    limits: _Limits
+    suns: Sequence[Sun]
+    limits: SearchLimits
     rng: np.random.Generator
     threads: int
     followed: dict[tuple[int, int], _Placement | None] = field(default_factory=dict)
@@ -317,8 +330,6 @@ class _Follower:
         postings: Sequence[float],
         *,
         found: Found,
-        min_score: float,
-        min_margin: float,
         last: bool,
     ) -> Footprint:
         """The one place that the film's own matches agree on.
@@ -335,13 +346,14 @@ class _Follower:
             raise PlacementError(
                 f"{head}fewer than {_MIN_BLOCKS} blocks of the film hold texture and find ground to compare with"
             )
-        score = guesses[0].candidate.score
-        if score < min_score:
+        limits = self.limits
+        likely = [guess for guess in guesses if guess.candidate.score >= limits.min_score]
+        if not likely:
             raise PlacementError(
-                f"{head}the highest correlation peak stands {score:.1f} standard deviations above its surroundings, "
-                f"{min_score:.1f} are needed"
+                f"{head}the likeliest place stands {guesses[0].candidate.score:.1f} standard deviations above its "
+                f"surroundings, {limits.min_score:.1f} are needed"
             )
-        tried = self._tried(guesses, postings[0])
+        tried = self._tried(likely, postings[0])
         if not tried:
             raise PlacementError(f"{head}no candidate of the search lies on the reference DEM")
         best, evidence, placement = tried[0]
@@ -349,14 +361,15 @@ class _Follower:
         rivals = [_against(other, placement, same_way=guess.candidate.view.way == way) for guess, _, other in tried[1:]]
         margin = float(placement.agreeing.sum() / max([1, *rivals]))
         placement = self._settled(way, evidence, placement)
-        limits = self.limits if last else replace(self.limits, min_share=max(self.limits.min_share, _SURE_SHARE))
+        if not last:
+            limits = replace(limits, min_agreeing_share=max(limits.min_agreeing_share, _SURE_SHARE))
         fault = limits.fault(placement)
         if fault is not None:
             raise PlacementError(head + fault)
-        if margin < min_margin:
+        if margin < limits.min_margin:
             raise PlacementError(
                 f"{head}{int(placement.agreeing.sum())} matches agree with one place and {max(rivals)} with another; "
-                f"the first must have {min_margin:.1f} times as many"
+                f"the first must have {limits.min_margin:.1f} times as many"
             )
         evidence, placement = self._under_the_best_sun(way, evidence, placement)
         for posting in postings[1:]:
@@ -372,14 +385,17 @@ class _Follower:
     def _tried(self, guesses: Sequence[_Guess], posting_m: float) -> list[tuple[_Guess, _Evidence, _Placement]]:
         """The best few places at the next posting, the one with most agreeing matches first."""
         tried: list[tuple[_Guess, _Evidence, _Placement]] = []
-        for guess in guesses[:_CANDIDATES]:
-            far_behind = guess.candidate.score < _NEAR_SHARE * guesses[0].candidate.score
-            if far_behind and any(self.limits.fault(placement) is None for *_, placement in tried):
+        taken = False
+        for number, guess in enumerate(guesses[:_CANDIDATES]):
+            if taken and (number >= _RIVALS or guess.candidate.score < _NEAR_SHARE * guesses[0].candidate.score):
                 break
             for evidence in guess.evidence:
                 placement = self._followed(guess, evidence, posting_m)
                 if placement is not None:
                     tried.append((guess, evidence, placement))
+                    if self.limits.fault(placement) is None:
+                        taken = True
+                        break
         return sorted(tried, key=lambda one: -int(one[2].agreeing.sum()))
 
     def _followed(self, guess: _Guess, evidence: _Evidence, posting_m: float) -> _Placement | None:
@@ -411,24 +427,30 @@ class _Follower:
         return placement
 
     def _under_the_best_sun(self, way: Way, evidence: _Evidence, placement: _Placement) -> tuple[_Evidence, _Placement]:
-        """Relief under the sun itself or one beside it, whichever the film matches best."""
-        if evidence.sun is None:
+        """The relief under the sun of the day that the film matches best, where it was the relief that placed it."""
+        if evidence.name != "relief":
             return evidence, placement
-        best = evidence, placement
-        for change in (-_SUN_CHANGE_DEG, _SUN_CHANGE_DEG):
-            sun = Sun((evidence.sun.azimuth_deg + change) % 360.0, evidence.sun.elevation_deg)
-            other = _Evidence(evidence.name, relief_reference(self.heights_on, *sun), sun)
-            found = self._placed(way, placement.camera, other, placement.posting_m)
-            if found.support > best[1].support and self.limits.fault(found) is None:
-                best = other, found
-        return best
+        best: tuple[_Evidence, float] | None = None
+        for sun in self.suns:
+            lit = _Evidence("relief", relief_reference(self.heights_on, *sun), sun)
+            found = self._placed(way, placement.camera, lit, placement.posting_m, every=_SUN_TILES)
+            if best is None or found.support > best[1]:
+                best = lit, found.support
+        if best is not None:
+            found = self._placed(way, placement.camera, best[0], placement.posting_m)
+            if self.limits.fault(found) is None:
+                return best[0], found
+        return evidence, placement
 
-    def _placed(self, way: Way, camera: PanoramicCamera, evidence: _Evidence, posting_m: float) -> _Placement:
+    def _placed(
+        self, way: Way, camera: PanoramicCamera, evidence: _Evidence, posting_m: float, *, every: int = 1
+    ) -> _Placement:
         laid = self.film.laid(turned=way.turned, mirrored=way.mirrored)
         level = laid.reduced(reduction_for(posting_m, self.pixel_m))
         return _placed(
-            level, camera, evidence.on_grid, self.heights_on, self.terrain.crs, posting_m, self.rng, self.threads
-        )
+            level, camera, _tiles(camera, posting_m)[::every], evidence.on_grid, self.heights_on, self.terrain.crs,
+            posting_m, self.rng, self.threads,
+        )  # fmt: skip
 
     def _record(
         self, candidate: Candidate, evidence: _Evidence, placement: _Placement, rival_score: float, margin: float
@@ -440,7 +462,7 @@ class _Follower:
             for c in (self.predicted, camera)
         )
         turn_deg, scale = math.degrees(cmath.phase(after / before)), abs(after / before)
-        sun = evidence.sun or suns(None, 0.0)[0]  # an image has none
+        sun = evidence.sun or self.suns[0]  # an image has none
         return Footprint(
             scene=self.predicted.scene,
             camera=camera,
@@ -455,7 +477,7 @@ class _Follower:
             margin=margin,
             agreeing_share=placement.share,
             residual_m=placement.residual_m,
-            sigma_m=placement.residual_m,
+            sigma_m=placement.sigma_m(),
             posting_m=placement.posting_m,
             reference=evidence.name,
             sun_azimuth_deg=sun.azimuth_deg,
@@ -485,82 +507,69 @@ def _stages(
     terrain: Terrain,
     *,
     image: _Evidence | None,
-    reliefs: Sequence[_Evidence],
+    relief: _Evidence,
     search_m: float,
     posting_m: float,
-    clear: float,
     threads: int,
 ) -> Iterator[tuple[list[_Guess], Found, bool]]:
     """Places of the first search, best first, after each stage, and whether it was the last: cheap stages come first.
 
-    The image in about the predicted heading, in every heading; the relief under one sun after another, together with
-    the image; the relief in every heading.
+    The image in about the predicted heading, in every heading and scale; the relief, alone and together with the image,
+    likewise.
 
     Raises
     ------
     NoOverlapError
         If there is nothing to compare with within the search window.
     """
-    height, crs = terrain.mean_m, terrain.crs
-    fine = FilmSearch(
-        film, predicted, height_m=height, crs=crs, posting_m=posting_m, search_m=search_m, threads=threads
-    )
-    coarse = FilmSearch(
-        film.reduced(2), predicted, height_m=height, crs=crs, posting_m=2 * posting_m, search_m=search_m,
-        threads=threads, grid=fine.grid.coarsened(2),
+    search = FilmSearch(
+        film, predicted, height_m=terrain.mean_m, crs=terrain.crs, posting_m=posting_m, search_m=search_m,
+        threads=threads,
     )  # fmt: skip
     guesses: list[_Guess] = []
     everything = NOTHING
 
-    def seen_by(evidence: _Evidence) -> tuple[_Evidence, Prepared, Prepared]:
-        raster = evidence.on_grid(fine.grid)
+    def seen_by(evidence: _Evidence) -> tuple[_Evidence, Prepared]:
+        raster = evidence.on_grid(search.grid)
         if not np.isfinite(raster).any():
-            area = ", ".join(f"{v:.0f}" for v in fine.grid.bounds)
+            area = ", ".join(f"{v:.0f}" for v in search.grid.bounds)
             raise NoOverlapError(
-                f"{predicted.scene}: the reference {evidence.name} holds nothing within ({area}) m of {crs}, where the "
-                "film was looked for"
+                f"{predicted.scene}: the reference {evidence.name} holds nothing within ({area}) m of {terrain.crs}, "
+                "where the film was looked for"
             )
-        return evidence, fine.prepared(raster), coarse.prepared(halved(raster))
+        return evidence, search.prepared(raster)
 
-    def look(*sources: tuple[_Evidence, Prepared, Prepared], widely: bool = False) -> float:
+    def look(
+        views: Sequence[View], *choices: Sequence[tuple[_Evidence, Prepared]], last: bool = False
+    ) -> tuple[list[_Guess], Found, bool]:
         nonlocal everything
-        evidence, close, rough = zip(*sources, strict=True)
-        found = search_widely(fine, coarse, close, rough) if widely else fine.run(close, fine.narrow_views())
-        guesses.extend(_Guess(candidate, evidence) for candidate in found.candidates)
-        everything = everything.and_more(found)
-        return max((candidate.score for candidate in found.candidates), default=0.0)
-
-    def so_far(*, last: bool = False) -> tuple[list[_Guess], Found, bool]:
+        for choice, found in zip(
+            choices, search.run([[p for _, p in choice] for choice in choices], views), strict=True
+        ):
+            guesses.extend(_Guess(candidate, tuple(e for e, _ in choice)) for candidate in found.candidates)
+            everything = Found.best_of([everything, found])
         kept: list[_Guess] = []
         for guess in sorted(guesses, key=lambda guess: -guess.candidate.score):
             if not any(guess.candidate.is_like(other.candidate) for other in kept):
                 kept.append(guess)
         return kept, everything, last
 
-    pictures = []
+    picture = None
     if image is not None:
         try:
-            pictures.append(seen_by(image))
+            picture = seen_by(image)
         except NoOverlapError as nothing:
             log.warning("%s; the relief remains", nothing)
-    if pictures:
-        look(*pictures)
-        yield so_far()
-        look(*pictures, widely=True)
-        yield so_far()
-    scores: list[tuple[float, _Evidence]] = []
-    for relief in reliefs:
-        scores.append((look(seen_by(relief)), relief))
-        if is_clear(everything, clear):
-            yield so_far()
-    likely = [relief for _, relief in sorted(scores, key=lambda one: -one[0])[:_LIKELY_SUNS]]
-    if pictures:
-        for relief in likely:
-            look(*pictures, seen_by(relief))
-    yield so_far()
-    for relief in likely:
-        look(*pictures, seen_by(relief), widely=True)
-    yield so_far(last=True)
+    if picture is None:
+        shape = seen_by(relief)
+        yield look(search.narrow_views(), [shape])
+        yield look(search.wide_views(), [shape], last=True)
+    else:
+        yield look(search.narrow_views(), [picture])
+        yield look(search.wide_views(), [picture])
+        shape = seen_by(relief)
+        yield look(search.narrow_views(), [shape], [picture, shape])
+        yield look(search.wide_views(), [shape], [picture, shape], last=True)
 
 
 def _postings(coarse_m: float, last_m: float) -> list[float]:
@@ -636,6 +645,7 @@ def _tiles(camera: PanoramicCamera, posting_m: float) -> FloatArray:
 def _placed(
     film: FilmImage,
     camera: PanoramicCamera,
+    tiles_mm: FloatArray,
     reference_on: OnGrid,
     heights_on: OnGrid,
     crs: str,
@@ -649,7 +659,7 @@ def _placed(
     matches = match_film_to_ground(
         film,
         camera,
-        _tiles(camera, posting_m),
+        tiles_mm,
         reference_on=reference_on,
         heights_on=heights_on,
         terrain=terrain,

@@ -96,6 +96,34 @@ def refit_camera(
     return Refit(fitted, weights, film_mm - fitted.project(ground_m))
 
 
+def refit_sigma_mm(
+    camera: PanoramicCamera,
+    ground_m: FloatArray,
+    sigma_mm: FloatArray,
+    elsewhere_m: FloatArray,
+    *,
+    prior_sigma: FloatArray = PRIOR_SIGMA,
+) -> FloatArray:
+    """Standard deviations (M, 2) of film points of other ground, by a camera fitted to some points.
+
+    Parameters
+    ----------
+    camera : PanoramicCamera
+        The fitted one.
+    ground_m : (N, 3) array
+        What it was fitted to, in its local frame.
+    sigma_mm : (N,) array
+        Standard deviations of their film points per coordinate.
+    elsewhere_m : (M, 3) array
+    prior_sigma : (13,) array
+        As in the fit.
+    """
+    jacobian = np.nan_to_num(_derivatives(camera, ground_m)) * prior_sigma / np.asarray(sigma_mm)[:, None, None]
+    information = np.einsum("nij,nik->jk", jacobian, jacobian) + np.eye(13)
+    change = _derivatives(camera, elsewhere_m) * prior_sigma
+    return np.asarray(np.sqrt(np.einsum("nij,jk,nik->ni", change, np.linalg.inv(information), change)))
+
+
 def _derivatives(camera: PanoramicCamera, ground_m: FloatArray) -> FloatArray:
     """Change of film points with the parameters, (N, 2, 13), mm per metre or radian."""
     parameters = camera.parameters()

@@ -6,6 +6,7 @@ import math
 from datetime import date
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from cosp.arrays import Float32Array, FloatArray
@@ -50,6 +51,20 @@ def relief_reference(heights_on: OnGrid, azimuth_deg: float, elevation_deg: floa
         rows, columns = grid.shape
         heights = heights_on(grid.window(-1, rows + 1, -1, columns + 1))
         return hillshade(heights, grid.step_x, azimuth_deg, elevation_deg)[1:-1, 1:-1]
+
+    return on_grid
+
+
+def convexity_reference(heights_on: OnGrid) -> OnGrid:
+    """A reference that is bright on the crests of an elevation model and dark in its valleys, whatever the sun.
+
+    Light changes where the slope does, so that the lines of shaded relief under any sun run along crests and valleys:
+    what places a film before its sun is known.
+    """
+
+    def on_grid(grid: PixelGrid) -> Float32Array:
+        smooth = cv2.GaussianBlur(heights_on(grid), (0, 0), 1.0)
+        return np.asarray(-cv2.Laplacian(smooth, cv2.CV_32F), np.float32)
 
     return on_grid
 

@@ -1,31 +1,32 @@
 """The first search: where on the ground a film may lie, from a prediction that may be far off in every respect.
 
 The film is cut into blocks along its length. Each block is brought to the map through the predicted camera, in each of
-the four ways that a film can be digitised, and correlated with the reference over the whole search window. The blocks'
-correlation surfaces are added for every shift, rotation and scale that the prediction may be wrong by. A template bears
-a rotation of a few degrees only; larger ones are searched by turning the templates themselves, coarsely first.
+the four ways that a film can be digitised, and correlated with the reference over the whole search window. What the
+blocks' correlation surfaces say for a place, as logs of odds, is added for every shift, rotation and scale that the
+prediction may be wrong by. A template bears a rotation of a few degrees only; larger ones are searched by turning the
+templates themselves.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy import fft
-from scipy.ndimage import maximum_filter
+from scipy.special import ndtri
 
 from cosp.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.statistics import nmad
 from cosp.matching.film_image import FilmImage
+from cosp.matching.kernels import highest_sums
 from cosp.matching.structural import orientation_channels
 
 # Blocks the film is cut into along its length.
@@ -35,24 +36,30 @@ _ROTATION_RANGE_DEG = 10.0
 _SCALE_RANGE = 0.05
 _ROTATION_REACH_DEG = 2.5
 _SCALE_REACH = 0.025
-_ROTATION_STEP_DEG = 5.0
-_SCALE_STEP = 0.05
-# Places that one view of the film gives, and views that the wide search hands on to the finer posting.
+# Places that one view of the film gives.
 _PEAKS = 3
-_VIEWS = 8
 # Peaks closer than this are one.
 _PEAK_DISTANCE_M = 6000.0
+# What is expected of a block: that it shows ground, and how many deviations its right place then stands out by.
+_SHOWS_GROUND = 0.5
+_STANDS_OUT = 3.0
+# The highest part of a surface that says how far out chance reaches, and the fewest cells of it.
+_TAIL, _TAIL_CELLS = 1e-3, 100
 # Share of a template that must lie on the reference, and what it must hold of texture.
 _MIN_COVER = 0.7
 _MIN_TEXTURE = 0.02
+_MIN_CELLS = 8.0
 _MIN_BLOCKS = 2
 _SMOOTHING_PX = 1.5
 _BINS = 5
-# Surfaces are added at every second pixel, after the highest of its neighbours has been taken.
-_POOL = 2
-# What a grid holds beyond the window, so that one of half the posting holds that of a search at the whole one.
-_SPARE_PX = 16
-# Rotations and scales are so far apart that the outermost block moves by so many of these pixels.
+# The smoothed channels are correlated in cells of two by two pixels, which hold all of them but 0.4 per cent.
+_CELL = 2
+# Of the orientations, nothing but their mean and their first harmonic is left after smoothing across them.
+_ORIENTATIONS = np.pi * np.arange(_BINS) / _BINS
+_HARMONICS = np.sqrt(2 / _BINS) * np.stack(
+    [np.full(_BINS, np.sqrt(0.5)), np.cos(2 * _ORIENTATIONS), np.sin(2 * _ORIENTATIONS)]
+).astype(np.float32)
+# Rotations and scales are so far apart that the outermost block moves by so many cells.
 _GUESS_STEP = 2.0
 # Degree of the polynomial that takes a block's map to its film.
 _DEGREE = 3
@@ -98,7 +105,7 @@ class Candidate:
     view : View
         With the rotation and the scale found.
     score : float
-        Height of the peak in standard deviations of its surroundings.
+        How likely the place is, as the height of a normal variable.
     x_mm : (N,) array
         Middle of each block along the film.
     predicted_m, found_m : (N, 2) arrays
@@ -149,19 +156,19 @@ class Found:
         """Score of the best other place than a candidate's."""
         return max((c.score for c in self.candidates if not c.is_like(candidate)), default=0.0)
 
-    def and_more(self, other: Found) -> Found:
-        """Both together; one candidate of each place, of each way the better map."""
-        ordered = sorted([*self.candidates, *other.candidates], key=lambda candidate: -candidate.score)
+    @classmethod
+    def best_of(cls, parts: Iterable[Found]) -> Found:
+        """Several together: one candidate of each place, of each way the map with the highest place."""
+        parts = list(parts)
+        candidates = sorted((c for part in parts for c in part.candidates), key=lambda candidate: -candidate.score)
         kept: list[Candidate] = []
-        for candidate in ordered:
+        for candidate in candidates:
             if not any(candidate.is_like(better) for better in kept):
                 kept.append(candidate)
-        maps = {score_map.view.way: score_map for score_map in other.maps}
-        for score_map in self.maps:
-            rival = maps.get(score_map.view.way)
-            if rival is None or np.nanmax(score_map.scores) >= np.nanmax(rival.scores):
-                maps[score_map.view.way] = score_map
-        return Found(tuple(kept), tuple(maps[way] for way in WAYS if way in maps))
+        maps: dict[Way, ScoreMap] = {}
+        for score_map in sorted((m for part in parts for m in part.maps), key=lambda m: -np.nanmax(m.scores)):
+            maps.setdefault(score_map.view.way, score_map)
+        return cls(tuple(kept), tuple(maps[way] for way in WAYS if way in maps))
 
 
 NOTHING = Found((), ())
@@ -204,8 +211,6 @@ class FilmSearch:
     search_m : float
         Largest error of the predicted place, in each direction.
     threads : int
-    grid : PixelGrid, optional
-        Of the references, for a wide search; one that just holds the window by default.
     """
 
     def __init__(
@@ -218,7 +223,6 @@ class FilmSearch:
         posting_m: float,
         search_m: float,
         threads: int,
-        grid: PixelGrid | None = None,
     ) -> None:
         self.posting_m = posting_m
         self._threads = threads
@@ -226,18 +230,17 @@ class FilmSearch:
         self._blocks = _blocks(camera, height_m, crs)
         self._middles = np.array([block.middle_m for block in self._blocks])
         self._arms = self._middles - self._middles.mean(axis=0)
-        # The same views are compared with one reference after another.
-        kept = BLOCKS * len(self.narrow_views() if grid is None else self.wide_views())
-        self._template = lru_cache(kept)(self._make_template)
-        self._radius = _POOL * math.ceil(search_m / posting_m / _POOL)
+        cell_m = self._cell_m = _CELL * posting_m
+        self._radius = math.ceil(search_m / cell_m)
         turning = math.hypot(math.radians(_ROTATION_RANGE_DEG + _ROTATION_REACH_DEG), _SCALE_RANGE + _SCALE_REACH)
-        self._margin = math.ceil(turning * float(np.linalg.norm(self._arms, axis=1).max()) / posting_m) + 2
+        self._margin = math.ceil(turning * float(np.linalg.norm(self._arms, axis=1).max()) / cell_m) + 2
         largest = 1 + _SCALE_RANGE + _SCALE_REACH
-        self._half = [math.ceil(block.reach_m * largest / posting_m) + 1 for block in self._blocks]
-        reach = (self._radius + self._margin + max(self._half) + _SPARE_PX) * posting_m
+        self._half = [math.ceil(block.reach_m * largest / cell_m) + 1 for block in self._blocks]
+        reach = (self._radius + self._margin + max(self._half) + 1) * cell_m
         low, high = self._middles.min(axis=0) - reach, self._middles.max(axis=0) + reach
-        self.grid = grid or PixelGrid.covering((low[0], low[1], high[0], high[1]), posting_m)
-        self._pixels = np.round(np.stack(self.grid.pixels(self._middles), axis=-1)).astype(int)
+        cells = PixelGrid.covering((low[0], low[1], high[0], high[1]), cell_m)
+        self.grid = PixelGrid.covering(cells.bounds, posting_m)
+        self._places = np.round(np.stack(cells.pixels(self._middles), axis=-1)).astype(int)
 
     def narrow_views(self) -> list[View]:
         """The film as predicted, whichever way round."""
@@ -245,156 +248,133 @@ class FilmSearch:
 
     def wide_views(self) -> list[View]:
         """The film in every heading and scale that it may have, whichever way round."""
-        rotations = np.radians(_steps(_ROTATION_RANGE_DEG, _ROTATION_STEP_DEG))
-        scales = _steps(_SCALE_RANGE, _SCALE_STEP)
+        rotations = np.radians(_between(_ROTATION_RANGE_DEG, _ROTATION_REACH_DEG))
+        scales = _between(_SCALE_RANGE, _SCALE_REACH)
         return [View(way, float(r), float(s)) for way in WAYS for r in rotations for s in scales]
 
-    def run(self, references: Sequence[Prepared], views: Sequence[View]) -> Found:
-        """The best places of some views of the film.
+    def run(self, choices: Sequence[Sequence[Prepared]], views: Sequence[View]) -> list[Found]:
+        """The best places of some views of the film, for each choice of references.
 
         Parameters
         ----------
-        references : prepared references
-            The evidence of several is added.
+        choices : lists of prepared references
+            The evidence of those in one list is taken together.
         views : View of each guess
         """
 
-        def work(view: View) -> Found:
-            return self._peaks(view, references)
+        def work(view: View) -> list[Found]:
+            return self._peaks(view, choices)
 
         if self._threads > 1:
             with ThreadPoolExecutor(self._threads) as pool:
                 results = list(pool.map(work, views))
         else:
             results = [work(view) for view in views]
-        found = NOTHING
-        for result in results:
-            found = found.and_more(result)
-        return found
+        return [Found.best_of(parts) for parts in zip(*results, strict=True)]
 
     def prepared(self, reference: Float32Array) -> Prepared:
         """A reference on `grid`, NaN where there is nothing, made ready to be compared with many views."""
-        channels = orientation_channels(reference, bins=_BINS, sigma_px=_SMOOTHING_PX)
-        valid = np.isfinite(reference) & (channels.max(axis=0) > 0)
-        if valid.any():
-            channels -= channels[:, valid].mean(axis=1)[:, None, None]
-        channels *= valid
+        channels, valid = _cells(reference)
         result = []
-        for (row, column), half in zip(self._pixels, self._half, strict=True):
+        for (row, column), half in zip(self._places, self._half, strict=True):
             reach = self._radius + self._margin + half
             window = (slice(row - reach, row + reach + 1), slice(column - reach, column + reach + 1))
             result.append(_BlockReference(channels[:, *window], valid[window], half))
         return result
 
-    def _peaks(self, view: View, references: Sequence[Prepared]) -> Found:
+    def _peaks(self, view: View, choices: Sequence[Sequence[Prepared]]) -> list[Found]:
         """Highest places of the blocks' surfaces, added for every rotation and scale near a view's."""
-        moved_px = self._arms @ (view.matrix - np.eye(2)).T / self.posting_m * [1, -1]
-        starts = np.round(moved_px[:, ::-1]).astype(int)  # rows, columns
-        surfaces, which = [], []
+        starts = np.round(self._moved(view)).astype(int)
+        references = {id(reference): reference for choice in choices for reference in choice}
+        surfaces: dict[int, dict[int, Float32Array]] = {key: {} for key in references}
         for index in range(len(self._blocks)):
             template = self._template(index, view)
             if template is None:
                 continue
-            channels, mask = template
-            spectrum = references[0][index].spectrum(channels)
-            norm = math.sqrt(float((channels**2).sum()) * float(mask.sum()))
+            channels, weights = template
+            norm = math.sqrt(float((channels**2).sum()) * float(weights.sum()))
             first = self._margin + starts[index]
-            for reference in references:
+            spectrum = next(iter(references.values()))[index].spectrum(channels)
+            for key, reference in references.items():
                 surface = reference[index].surface(spectrum, norm, first, 2 * self._radius + 1)
                 if np.isfinite(surface).mean() > 0.005:
-                    surfaces.append(surface)
-                    which.append(index)
-        chosen = np.array(which, int)
-        if len(np.unique(chosen)) < _MIN_BLOCKS:
-            return NOTHING
-        return self._added(view, np.stack(surfaces), chosen, starts)
+                    surfaces[key][index] = surface
+        results = []
+        for choice in choices:
+            kept = [surfaces[id(reference)] for reference in choice]
+            together = {
+                index: np.stack([one[index] for one in kept if index in one]) for index in sorted(set().union(*kept))
+            }
+            results.append(self._added(view, together, starts) if len(together) >= _MIN_BLOCKS else NOTHING)
+        return results
 
-    def _make_template(self, index: int, view: View) -> tuple[Float32Array, BoolArray] | None:
-        """Channels of a block as a view has it, and where they hold texture."""
+    def _moved(self, view: View) -> FloatArray:
+        """Rows and columns that the blocks move by from the prediction to a view, in cells."""
+        moved_m = self._arms @ (view.matrix - np.eye(2)).T
+        return np.asarray(moved_m[:, ::-1] / self._cell_m * [-1, 1])
+
+    def _template(self, index: int, view: View) -> tuple[Float32Array, Float32Array] | None:
+        """Channels of a block as a view has it, and how much of each cell holds texture."""
         block, half = self._blocks[index], self._half[index]
-        step = np.arange(-half, half + 1) * self.posting_m
+        reach = _CELL * (2 * half + 1) / 2 - 0.5
+        step = np.arange(-reach, reach + 1) * self.posting_m
         offsets = np.stack(np.broadcast_arrays(step[None, :], -step[:, None]), axis=-1)
         film_mm = block.film(offsets @ np.linalg.inv(view.matrix).T)
-        image = self._films[view.way].sample(film_mm)
-        channels = orientation_channels(image, bins=_BINS, sigma_px=_SMOOTHING_PX)
-        mask = np.isfinite(image) & (channels.max(axis=0) > 0)
-        if mask.sum() < max(30.0, _MIN_TEXTURE * float(np.isfinite(film_mm[..., 0]).sum())):
-            return None
-        channels = (channels - channels[:, mask].mean(axis=1)[:, None, None]) * mask
-        return channels.astype(np.float32), mask
+        channels, weights = _cells(self._films[view.way].sample(film_mm))
+        inside = float(np.isfinite(film_mm[..., 0]).sum()) / _CELL**2
+        return (channels, weights) if weights.sum() >= max(_MIN_CELLS, _MIN_TEXTURE * inside) else None
 
-    def _added(self, view: View, surfaces: Float32Array, which: IntArray, starts: IntArray) -> Found:
-        indices = np.unique(which)
-        standard, covered = zip(*(_standardised(surfaces[which == index]) for index in indices), strict=True)
-        reach = float(np.linalg.norm(self._arms, axis=1).max()) / self.posting_m / _POOL
-        shape = standard[0].shape
-        best = np.full(shape, -np.inf, np.float32)
-        argument = np.zeros(shape, np.int32)
-        guesses: list[tuple[View, IntArray]] = []
-        for rotation in _steps(math.radians(_ROTATION_REACH_DEG), _GUESS_STEP / reach):
-            for scale in _steps(_SCALE_REACH, _GUESS_STEP / reach):
-                guess = View(view.way, view.rotation + float(rotation), view.scale + float(scale))
-                moved = self._arms @ (guess.matrix - np.eye(2)).T / self.posting_m * [1, -1]
-                offsets = np.round((moved[:, ::-1] - starts) / _POOL).astype(int)
-                total, number = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-                for surface, cover, index in zip(standard, covered, indices, strict=True):
-                    down, right = (int(v) for v in offsets[index])
-                    source = (_overlap(shape[0], down), _overlap(shape[1], right))
-                    target = (_overlap(shape[0], -down), _overlap(shape[1], -right))
-                    total[target] += surface[source]
-                    number[target] += cover[source]
-                score = np.where(number >= _MIN_BLOCKS, total / np.sqrt(np.maximum(number, 1)), -np.inf)
-                better = score > best
-                best[better] = score[better]
-                argument[better] = len(guesses)
-                guesses.append((guess, offsets))
-        scores = ScoreMap(view, np.where(np.isfinite(best), best, np.nan), _POOL * self.posting_m)
+    def _added(self, view: View, surfaces: dict[int, Float32Array], starts: IntArray) -> Found:
+        indices = np.array(list(surfaces))
+        standard, covered = zip(*(_evidence(surface) for surface in surfaces.values()), strict=True)
+        reach = float(np.linalg.norm(self._arms, axis=1).max()) / self._cell_m
+        guesses = [
+            View(view.way, view.rotation + float(rotation), view.scale + float(scale))
+            for rotation in _steps(math.radians(_ROTATION_REACH_DEG), _GUESS_STEP / reach)
+            for scale in _steps(_SCALE_REACH, _GUESS_STEP / reach)
+        ]
+        offsets = np.stack([np.round(self._moved(guess) - starts).astype(int)[indices] for guess in guesses])
+        evidence, argument = highest_sums(np.stack(standard), offsets)
+        known = np.sum(covered, axis=0) >= _MIN_BLOCKS
+        best = np.where(known, np.sqrt(2 * np.maximum(evidence, 0)), -np.inf).astype(np.float32)
+        scores = ScoreMap(view, np.where(np.isfinite(best), best, np.nan), self._cell_m)
         candidates = []
         remaining = best.copy()
-        near = round(_PEAK_DISTANCE_M / scores.step_m)
+        near = round(_PEAK_DISTANCE_M / self._cell_m)
         for _ in range(_PEAKS):
-            row, column = (int(v) for v in np.unravel_index(int(remaining.argmax()), shape))
+            row, column = (int(v) for v in np.unravel_index(int(remaining.argmax()), best.shape))
             if not np.isfinite(remaining[row, column]):
                 break
-            guess, offsets = guesses[int(argument[row, column])]
-            candidate = self._candidate(
-                guess, float(best[row, column]), surfaces, which, starts, (row, column), offsets
-            )
+            number = int(argument[row, column])
+            places = np.array([row, column]) + offsets[number]
+            candidate = self._candidate(guesses[number], float(best[row, column]), surfaces, starts, places)
             if candidate is not None:
                 candidates.append(candidate)
             remaining[max(row - near, 0) : row + near + 1, max(column - near, 0) : column + near + 1] = -np.inf
         return Found(tuple(candidates), (scores,) if np.isfinite(best).any() else ())
 
     def _candidate(
-        self,
-        guess: View,
-        score: float,
-        surfaces: Float32Array,
-        which: IntArray,
-        starts: IntArray,
-        place: tuple[int, int],
-        offsets: IntArray,
+        self, guess: View, score: float, surfaces: dict[int, Float32Array], starts: IntArray, places: IntArray
     ) -> Candidate | None:
         """A peak of the sum brought back to the highest place of each block's own surface near it."""
-        indices = np.unique(which)
-        shifts = np.full((len(indices), 2), np.nan)
-        for i, index in enumerate(indices):
-            together = surfaces[which == index].mean(axis=0)
-            at = _POOL * (np.array(place) + offsets[index])
-            shifts[i] = _top_near(together, at) - self._radius + starts[index]
+        indices = np.array(list(surfaces))
+        tops = [
+            _top_near(surface.mean(axis=0), place) for surface, place in zip(surfaces.values(), places, strict=True)
+        ]
+        shifts = np.array(tops) - self._radius + starts[indices]
         known = np.isfinite(shifts).all(axis=1)
         if known.sum() < _MIN_BLOCKS:
             return None
         predicted = self._middles[indices[known]]
-        pixels = self._pixels[indices[known]] + shifts[known]
         x_mm = np.array([(self._blocks[i].low_mm + self._blocks[i].high_mm) / 2 for i in indices[known]])
-        return Candidate(guess, score, x_mm, predicted, self.grid.points(pixels[:, 0], pixels[:, 1]))
+        found = predicted + shifts[known][:, ::-1] * [self._cell_m, -self._cell_m]
+        return Candidate(guess, score, x_mm, predicted, found)
 
 
 class _BlockReference:
     """The surroundings of one block in the reference, transformed once for many templates."""
 
-    def __init__(self, channels: Float32Array, valid: BoolArray, half: int) -> None:
+    def __init__(self, channels: Float32Array, valid: Float32Array, half: int) -> None:
         rows, columns = valid.shape
         self._size = (fft.next_fast_len(rows), fft.next_fast_len(columns, real=True))
         self._channels = fft.rfft2(np.ascontiguousarray(channels), s=self._size)
@@ -402,7 +382,7 @@ class _BlockReference:
         box = (2 * half + 1, 2 * half + 1)
         inside = (slice(half, rows - half), slice(half, columns - half))
         self._energy = cv2.blur(np.einsum("kij,kij->ij", channels, channels), box)[inside]
-        self._cover = cv2.blur(valid.astype(np.float32), box)[inside]
+        self._cover = cv2.blur(valid, box)[inside]
 
     def spectrum(self, template: Float32Array) -> NDArray[np.complex64]:
         """Conjugate transform of a template, for references of one block."""
@@ -444,69 +424,72 @@ def _blocks(camera: PanoramicCamera, height_m: float, crs: str) -> list[_Block]:
 
 
 def _terms(places: FloatArray) -> FloatArray:
-    x, y = places[..., 0], places[..., 1]
-    return np.stack([x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=-1)
+    x, y = (np.vander(places[..., axis].ravel(), _DEGREE + 1, increasing=True).T for axis in (0, 1))
+    terms = np.stack([x[i] * y[j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=-1)
+    return terms.reshape(*places.shape[:-1], -1)
+
+
+def _cells(image: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Harmonics of the orientations of an image in cells, about their mean, and how much of each cell is textured."""
+    channels = np.tensordot(_HARMONICS, orientation_channels(image, bins=_BINS, sigma_px=_SMOOTHING_PX), 1)
+    textured = np.isfinite(image) & (channels[0] > 0)
+    if textured.any():
+        channels -= channels[:, textured].mean(axis=1)[:, None, None]
+    channels *= textured
+    return _by_cells(channels), _by_cells(textured[None].astype(np.float32))[0]
+
+
+def _by_cells(layers: Float32Array) -> Float32Array:
+    """Means of the pixels of each cell; pixels of a ragged edge are left out."""
+    rows, columns = (n // _CELL * _CELL for n in layers.shape[1:])
+    parts = [layers[:, i:rows:_CELL, j:columns:_CELL] for i in range(_CELL) for j in range(_CELL)]
+    return np.asarray(sum(parts[1:], parts[0]) / len(parts), np.float32)
+
+
+def _evidence(surfaces: Float32Array) -> tuple[Float32Array, BoolArray]:
+    """How much the surfaces of one block speak for each place: log of its odds to nothing lying there, 0 where unknown.
+
+    A block may show nothing but cloud: then its surface says nothing. If it shows ground, the right place stands a few
+    standard deviations out.
+    """
+    standard, covered = _standardised(surfaces)
+    ground = _SHOWS_GROUND * np.exp(np.minimum(_STANDS_OUT * (standard - _STANDS_OUT / 2), 80.0))
+    return np.where(covered, np.log(1 - _SHOWS_GROUND + ground), 0.0).astype(np.float32), covered
 
 
 def _standardised(surfaces: Float32Array) -> tuple[Float32Array, BoolArray]:
-    """Surfaces of one block together: every second pixel, in standard deviations about the median, maxima spread.
+    """Surfaces of one block together, in standard deviations about the median, maxima spread.
 
     Image and relief show the same mountains, so that chance favours a place in both: what they say together is brought
     to one standard deviation again.
     """
-    covered: BoolArray = np.asarray(np.isfinite(surfaces[:, ::_POOL, ::_POOL]).all(axis=0))
+    covered: BoolArray = np.asarray(np.isfinite(surfaces).all(axis=0))
     total = np.zeros(covered.shape, np.float32)
     for surface in surfaces:
-        spread = maximum_filter(np.where(np.isfinite(surface), surface, -1.0), size=3)[::_POOL, ::_POOL]
+        spread = cv2.dilate(np.where(np.isfinite(surface), surface, -1.0).astype(np.float32), np.ones((3, 3)))
         total += _in_deviations(spread, covered)
     return _in_deviations(total, covered) if len(surfaces) > 1 else total, covered
 
 
 def _in_deviations(values: Float32Array, covered: BoolArray) -> Float32Array:
-    """Values in standard deviations about the median of those that are covered; 0 elsewhere."""
+    """Values in standard deviations about the median of those that are covered; 0 elsewhere.
+
+    The highest thousandth says what a deviation is where it lies further out than that of a normal distribution: more
+    of a small surface, which one right place must not fill.
+    """
     known = values[covered]
     if not len(known):
         return np.zeros(values.shape, np.float32)
-    return np.where(covered, (values - np.median(known)) / max(nmad(known), 1e-6), 0.0).astype(np.float32)
+    share = float(np.clip(_TAIL_CELLS / len(known), _TAIL, 0.1))
+    middle, high = np.quantile(known, [0.5, 1 - share])
+    deviation = max(nmad(known), (high - middle) / ndtri(1 - share), 1e-6)
+    return np.where(covered, (values - middle) / deviation, 0.0).astype(np.float32)
 
 
-def halved(raster: Float32Array) -> Float32Array:
-    """Means of two by two pixels of a raster, of those that are not NaN."""
-    known = np.isfinite(raster)
-    size = (-(-raster.shape[1] // 2), -(-raster.shape[0] // 2))
-    border = ((0, raster.shape[0] % 2), (0, raster.shape[1] % 2))
-    filled, weight = (np.pad(a, border) for a in (np.where(known, raster, 0).astype(np.float32), known))
-    total = cv2.resize(filled, size, interpolation=cv2.INTER_AREA)
-    share = cv2.resize(weight.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return np.where(share > 0.4, total / np.maximum(share, 0.1), np.nan).astype(np.float32)
-
-
-def search_widely(
-    fine: FilmSearch, coarse: FilmSearch, references: Sequence[Prepared], rough: Sequence[Prepared]
-) -> Found:
-    """The film in all headings and scales: roughly first, the best of it again at the finer posting.
-
-    Parameters
-    ----------
-    fine, coarse : FilmSearch
-        The second at twice the posting of the first, on its coarsened grid.
-    references, rough : prepared references of either
-    """
-    found = coarse.run(rough, coarse.wide_views())
-    views = [_within_range(candidate.view) for candidate in found.candidates[:_VIEWS]]
-    return fine.run(references, views) if views else NOTHING
-
-
-def _within_range(view: View) -> View:
-    most = math.radians(_ROTATION_RANGE_DEG)
-    return View(view.way, min(max(view.rotation, -most), most), min(max(view.scale, -_SCALE_RANGE), _SCALE_RANGE))
-
-
-def is_clear(found: Found, clear: float) -> bool:
-    """Whether the best place stands far above the ground and above all other places."""
-    return bool(found.candidates) and found.candidates[0].score >= max(
-        clear, 1.3 * found.rival_score(found.candidates[0])
-    )
+def _between(limit: float, reach: float) -> FloatArray:
+    """Middles of the fewest intervals of so much reach to either side that cover -limit to limit."""
+    count = math.ceil(limit / reach - 1e-9)
+    return (np.arange(count) - (count - 1) / 2) * 2 * limit / count
 
 
 def _steps(limit: float, step: float) -> FloatArray:
@@ -514,11 +497,7 @@ def _steps(limit: float, step: float) -> FloatArray:
     return np.arange(-count, count + 1) * step
 
 
-def _overlap(length: int, shift: int) -> slice:
-    return slice(max(shift, 0), max(length + min(shift, 0), 0))
-
-
-def _top_near(surface: Float32Array, place: FloatArray, reach: int = 4) -> FloatArray:
+def _top_near(surface: Float32Array, place: FloatArray, reach: int = 2) -> FloatArray:
     """Highest pixel near a place of a surface; NaN outside."""
     row, column = (int(v) for v in place)
     row0, column0 = max(row - reach, 0), max(column - reach, 0)

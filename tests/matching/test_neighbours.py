@@ -8,7 +8,7 @@ import pytest
 from cosp.matching.footprint import Footprint
 from cosp.matching.ground import ground_pixel_m
 from cosp.matching.neighbours import PlacedFrame, expected_frame
-from cosp.matching.placement import score_in_window, shift_m, turned_about_centre
+from cosp.matching.placement import SearchLimits, shift_m, turned_about_centre
 
 from .conftest import make_camera, moved
 
@@ -75,6 +75,7 @@ def test_films_of_one_camera_lie_alike_and_a_frame_known_by_them_alone_says_so()
 def test_a_smaller_window_needs_a_lower_score_for_the_same_chance():
     # Expected maxima of n independent normal values, n being the window's area.
     maxima = [np.sqrt(2 * np.log(area)) for area in (200.0**2, 20.0**2)]
-    assert score_in_window(maxima[0], 100.0, 10.0) == pytest.approx(maxima[1])
-    assert score_in_window(8.0, 100.0, 100.0) == 8.0
-    assert score_in_window(8.0, 100.0, 1.0) < 8.0
+    limits = SearchLimits(240.0, 30.0, float(maxima[0]), 2.0, 12, 0.3, 0.5)
+    assert limits.in_window(100.0, 10.0).min_score == pytest.approx(maxima[1])
+    assert limits.in_window(100.0, 100.0) == limits
+    assert limits.in_window(100.0, 1.0).min_score < maxima[1]

@@ -10,14 +10,17 @@ from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.io import rasters, records
 from cosp.matching.footprint import Attempt, Footprint
+from cosp.matching.placement import SearchLimits
 from scripts.place_frame import place_frame
 
 from .conftest import CRS, make_camera, moved, texture
 
-LIMITS = {
-    "day": None, "reference_dem_heights": "ellipsoidal", "search_km": 100, "coarse_posting_m": 240.0,
-    "fine_posting_m": 80.0, "min_score": 8.0, "min_margin": 2.0, "min_agreeing": 12, "min_agreeing_share": 0.3,
-    "min_block_share": 0.5, "seed": 1, "threads": 1,
+LIMITS = SearchLimits(
+    coarse_posting_m=240.0, fine_posting_m=80.0, min_score=8.0, min_margin=2.0, min_agreeing=12,
+    min_agreeing_share=0.3, min_block_share=0.5,
+)  # fmt: skip
+CHOICES = {
+    "day": None, "reference_dem_heights": "ellipsoidal", "search_km": 100, "limits": LIMITS, "seed": 1, "threads": 1,
 }  # fmt: skip
 
 
@@ -45,7 +48,7 @@ def settle(folder, world, film, predicted, others):
     place_frame(
         folder / "own.json", [folder / f"other{number}.json" for number in range(len(others))], folder / "film.tif",
         folder / "straight.json", folder / "camera.json", folder / "dem.tif", folder / "image.tif",
-        folder / "footprint.json", folder / "right.tif", folder / "film.json", **LIMITS,
+        folder / "footprint.json", folder / "right.tif", folder / "film.json", **CHOICES,
     )  # fmt: skip
     return records.read(folder / "footprint.json", Footprint)
 
@@ -87,7 +90,7 @@ def test_a_film_seen_through_its_back_is_put_right_and_its_summary_says_so(tmp_p
     right, said = tmp_path / "film.tif", tmp_path / "film.json"
     place_frame(
         tmp_path / "own.json", [], tmp_path / "straight.tif", tmp_path / "straight.json", tmp_path / "camera.json",
-        tmp_path / "dem.tif", None, tmp_path / "footprint.json", right, said, **LIMITS,
+        tmp_path / "dem.tif", None, tmp_path / "footprint.json", right, said, **CHOICES,
     )  # fmt: skip
     np.testing.assert_array_equal(rasters.read(right), grey[:, ::-1])
     summary = records.read_json(said)

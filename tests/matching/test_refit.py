@@ -1,6 +1,6 @@
 import numpy as np
 
-from cosp.matching.refit import refit_camera
+from cosp.matching.refit import refit_camera, refit_sigma_mm
 
 from .conftest import moved
 
@@ -41,3 +41,21 @@ def test_few_points_leave_the_camera_where_it_was_expected(camera):
     film_mm, ground = control(camera, np.random.default_rng(3), count=4)
     fitted = refit_camera(camera, film_mm, ground, np.full(4, 0.1)).camera
     np.testing.assert_allclose(fitted.parameters(), camera.parameters(), atol=1e-4)
+
+
+def test_sigma_says_how_far_a_fit_to_one_end_misses_the_other(camera):
+    rng = np.random.default_rng(7)
+    film_mm, ground = control(camera, rng, 120)
+    near = film_mm[:, 0] < 0
+    film_mm, ground, sigma = film_mm[near], ground[near], np.full(near.sum(), 0.05)
+    elsewhere = camera.locate(lattice(camera), 1000.0)
+    errors = []
+    for _ in range(20):
+        noisy = film_mm + sigma[:, None] * rng.standard_normal(film_mm.shape)
+        fitted = refit_camera(camera, noisy, ground, sigma).camera
+        errors.append(fitted.project(elsewhere) - lattice(camera))
+    said = refit_sigma_mm(camera, ground, sigma, elsewhere)
+    ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / said
+    assert 0.6 < np.median(ratio) < 1.4
+    far = lattice(camera)[:, 0] > 150
+    assert said[far].max() > 5 * said[~far].min()

@@ -12,14 +12,18 @@ from cosp.io import rasters, records, tables
 from cosp.io.films import put_right
 from cosp.matching.footprint import Footprint
 from cosp.matching.ground import grown, map_bounds
-from cosp.matching.placement import locate_film
-from cosp.matching.relief import hillshade, relief_sigma_m, sun_at, suns
+from cosp.matching.placement import SearchLimits, locate_film
+from cosp.matching.relief import convexity_reference, hillshade, relief_sigma_m, sun_at, suns
 from scripts.collect_gcps import collect_gcps
 from scripts.match_tiles import match_tiles
 
 from .conftest import CRS, World, make_camera, moved, texture
 
 POSTING = 60.0
+LIMITS = SearchLimits(
+    coarse_posting_m=240.0, fine_posting_m=80.0, min_score=5.5, min_margin=2.0, min_agreeing=12,
+    min_agreeing_share=0.3, min_block_share=0.5,
+)  # fmt: skip
 
 
 def mountains(bounds, rng):
@@ -73,6 +77,14 @@ def test_control_from_relief_lies_within_half_a_posting_and_says_so_though_the_f
     assert 0.15 < rms / kept["sigma_px"].median() < 1.3
 
 
+def test_crests_are_bright_and_valleys_dark_whatever_the_sun():
+    grid = PixelGrid(30.0, -30.0, POSTING, -POSTING, (40, 80))
+    wave = np.cos(2 * np.pi * np.arange(80) / 20.0)
+    convexity = convexity_reference(lambda _: np.broadcast_to(100 * wave, grid.shape).astype(np.float32))(grid)
+    inside = convexity[5:-5, 5:-5] / convexity[5:-5, 5:-5].max()
+    np.testing.assert_allclose(inside, np.broadcast_to(wave[5:-5], inside.shape), atol=0.03)
+
+
 def test_sigma_of_relief_stays_between_a_third_and_half_a_posting():
     np.testing.assert_allclose(relief_sigma_m(np.array([1.0, 12.0, 40.0]), 30.0), [9.0, 12.0, 15.0])
 
@@ -110,8 +122,7 @@ def test_a_film_is_placed_by_relief_alone_under_a_sun_that_is_not_known():
     world = mountains(grown(map_bounds(camera, CRS, (0.0, 3500.0)), 12000.0), rng)
     located = locate_film(
         world.expose(camera, rng=rng), moved(camera, 6000.0, -4000.0), reference_on=None, day=None,
-        heights_on=world.on(world.heights), crs=CRS, search_m=9000.0, coarse_posting_m=240.0, fine_posting_m=80.0,
-        min_score=8.0, min_margin=2.0, min_agreeing=12, min_agreeing_share=0.3, min_block_share=0.5,
+        heights_on=world.on(world.heights), crs=CRS, search_m=9000.0, limits=LIMITS,
         rng=np.random.default_rng(0), threads=1,
     )  # fmt: skip
     points = np.stack(np.meshgrid(np.linspace(-145, 145, 7), np.linspace(-26, 26, 3)), -1)

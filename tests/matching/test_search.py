@@ -4,13 +4,15 @@ from datetime import date
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from cosp.errors import PlacementError
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.matching.film_image import FilmImage
-from cosp.matching.placement import locate_film, turned_about_centre
-from cosp.matching.search import Candidate, Found, View, Way, _standardised, halved
+from cosp.matching.ground import ground_pixel_m
+from cosp.matching.placement import SearchLimits, locate_film, turned_about_centre
+from cosp.matching.search import Candidate, Found, View, Way, _between, _evidence, _standardised
 
 from .conftest import CRS, FILM_PIXEL_MM, moved, texture
 
@@ -18,6 +20,12 @@ from .conftest import CRS, FILM_PIXEL_MM, moved, texture
 @pytest.fixture(scope="module")
 def film(world, camera):
     return world.expose(camera, rng=np.random.default_rng(1))
+
+
+LIMITS = SearchLimits(
+    coarse_posting_m=240.0, fine_posting_m=80.0, min_score=5.5, min_margin=3.0, min_agreeing=20,
+    min_agreeing_share=0.3, min_block_share=0.5,
+)  # fmt: skip
 
 
 def locate(film, predicted, world, *, reference=None, heights=None, search_m=8000.0, with_image=True, day=None):
@@ -29,13 +37,7 @@ def locate(film, predicted, world, *, reference=None, heights=None, search_m=800
         day=day,
         crs=CRS,
         search_m=search_m,
-        coarse_posting_m=240.0,
-        fine_posting_m=80.0,
-        min_score=7.0,
-        min_margin=3.0,
-        min_agreeing=20,
-        min_agreeing_share=0.3,
-        min_block_share=0.5,
+        limits=LIMITS,
         rng=np.random.default_rng(0),
         threads=1,
     )
@@ -127,15 +129,10 @@ def test_a_rival_is_another_place_or_another_way_round():
         candidate(6.0, 3e4, Way()),
         candidate(7.0, 0.0, Way(False, True)),
     )
-    found = Found((best,), ()).and_more(Found((mirrored, near, far), ()))
+    found = Found.best_of([Found((best,), ()), Found((mirrored, near, far), ())])
     assert found.candidates == (best, mirrored, far)
     assert found.rival_score(best) == 7.0
     assert found.rival_score(mirrored) == 12.0
-
-
-def test_halving_a_raster_takes_the_mean_of_what_is_known():
-    raster = np.array([[1.0, 3.0, np.nan, np.nan, 5.0], [5.0, np.nan, np.nan, 2.0, 7.0]], np.float32)
-    np.testing.assert_allclose(halved(raster), [[3.0, np.nan, 6.0]])
 
 
 def test_evidence_that_agrees_by_chance_counts_once():
@@ -148,3 +145,50 @@ def test_evidence_that_agrees_by_chance_counts_once():
     assert np.abs(np.median(together[covered])) < 0.05
     assert not covered[:, :10].any()
     assert (together[:, :10] == 0).all()
+
+
+def test_a_block_that_shows_cloud_says_nothing_and_one_that_shows_ground_decides():
+    noise = np.random.default_rng(2).standard_normal((1, 300, 300)).astype(np.float32)
+    at_ground = noise.copy()
+    at_ground[0, 100, 200] = 9.0 * noise.std()
+    cloud, _ = _evidence(noise)
+    ground, _ = _evidence(at_ground)
+    assert cloud.min() > -0.7  # the log of a half
+    assert cloud[100, 200] + ground[100, 200] > 10.0
+    assert np.unravel_index(ground.argmax(), ground.shape)[0] in range(99, 102)
+    assert np.delete(np.sort(ground.ravel()), np.s_[-9:]).max() < 9.0
+
+
+def test_heavy_tails_count_as_much_as_those_of_a_normal_distribution():
+    rng = np.random.default_rng(3)
+    normal = rng.standard_normal((1, 400, 400))
+    heavy = rng.standard_t(4, (1, 400, 400))
+    highest = [float(_standardised(surface.astype(np.float32))[0].max()) for surface in (normal, heavy)]
+    assert highest[1] < 3 * highest[0]
+    thousandth = [float(np.quantile(_standardised(s.astype(np.float32))[0], 0.999)) for s in (normal, heavy)]
+    assert thousandth[1] == pytest.approx(3.09, abs=0.15)
+
+
+def test_views_reach_every_heading_and_scale():
+    middles = _between(10.0, 2.5)
+    assert len(middles) == 4
+    wanted = np.linspace(-10.0, 10.0, 81)
+    assert np.abs(wanted[:, None] - middles).min(axis=1).max() <= 2.5
+
+
+@pytest.mark.slow
+def test_a_film_of_which_clouds_leave_three_tenths_is_placed(camera, world, film):
+    pixels = film.read(Window(0, film.grid.shape[0], 0, film.grid.shape[1])).copy()
+    rng = np.random.default_rng(6)
+    where = gaussian_filter(rng.standard_normal(pixels.shape), 18.0 / FILM_PIXEL_MM)
+    hidden = where > np.quantile(where, 0.3)
+    pixels[hidden] = texture(pixels.shape, rng)[hidden] / 4 + 180
+    predicted = moved(camera, -7000.0, 5000.0)
+    footprint = locate(FilmImage.from_array(pixels, film.grid), predicted, world, search_m=12000.0)
+    points = np.stack(np.meshgrid(np.linspace(-195, 195, 79), np.linspace(-26, 26, 9)), -1)
+    rows, columns = film.grid.pixels(points)
+    seen = ~hidden[np.round(rows).astype(int), np.round(columns).astype(int)]
+    error_px = np.linalg.norm(footprint.camera.project(camera.locate(points, 1000.0)) - points, axis=-1) / FILM_PIXEL_MM
+    assert error_px[seen].max() < 2.0
+    error_m = error_px * ground_pixel_m(camera, FILM_PIXEL_MM, 0.0)
+    assert footprint.sigma_m / 10 < error_m.max() < 3 * footprint.sigma_m
