@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from cosp.camera.missions import WIDTH_MM, mission_for
+from cosp.errors import InputError
 from cosp.film.arrangement import Pose, posed
 from cosp.film.exposure import find_exposure
 from cosp.film.joining import Layout, compose_reduced
@@ -50,15 +51,18 @@ def trace_stripes(
     layout = records.from_plain(seams["layout"], Layout, f"{seams_path}: layout")
     parts = laid_parts(part_paths, seams)
     factor = max(1, round(search_pixel_mm / pixel_mm))
-    exposure = find_exposure(
-        compose_reduced(parts, layout, factor),
-        pixel_mm=pixel_mm,
-        factor=factor,
-        length_mm=mission.scan_length_mm,
-        width_mm=WIDTH_MM,
-        length_tolerance=length_tolerance,
-        width_tolerance=width_tolerance,
-    )
+    try:
+        exposure = find_exposure(
+            compose_reduced(parts, layout, factor),
+            pixel_mm=pixel_mm,
+            factor=factor,
+            length_mm=mission.scan_length_mm,
+            width_mm=WIDTH_MM,
+            length_tolerance=length_tolerance,
+            width_tolerance=width_tolerance,
+        )
+    except InputError as problem:
+        raise InputError(f"{', '.join(map(str, part_paths))}: {problem}") from problem
     records.write(exposure_path, exposure)
     log.info("%s", exposure)
 

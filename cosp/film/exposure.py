@@ -62,6 +62,9 @@ class Exposure:
 # Step of grey that counts in full as the edge of a picture; brighter steps count no more, so that snow rules nothing.
 _FULL_STEP = 40.0
 _TILT_LIMIT_DEG = 1.0
+# Lines that look so much more like the long sides, at another distance, show that the size of a pixel is wrong.
+_CLEARLY = 1.25
+_WRONG_SCALE = 0.3
 # Lines thinner than this are no picture; stripes are a tenth of a millimetre and lie 0.6 mm and more beside it.
 LINE_MM = 0.55
 # Fewer bright columns than this are a scratch, a mark or the border of the scan.
@@ -111,13 +114,13 @@ def find_exposure(
     Raises
     ------
     InputError
-        Where nothing looks like the long sides of the format.
+        Where nothing looks like the long sides of the format, or what does lies too far apart or too close.
     """
     step_mm = pixel_mm * factor
     valid = image > 0 if valid is None else valid
     # Thin bright lines beside the picture (stripes, scratches) would look like its edge: an opening takes them away.
     across = _steps(without_lines(image, step_mm), valid, axis=0)
-    tilt, top, bottom = _long_sides(across, step_mm, width_mm, width_tolerance, length_mm)
+    tilt, top, bottom = _long_sides(across, step_mm, width_mm, width_tolerance, length_mm, pixel_mm)
     top_line, top_share, top_sd = _fit_line(across, tilt, top, reach=1.5 / step_mm)
     bottom_line, bottom_share, bottom_sd = _fit_line(-across, tilt, bottom, reach=1.5 / step_mm)
     if max(top_share, bottom_share) < 0.1:
@@ -133,6 +136,8 @@ def find_exposure(
     left, right, ends, end_sd = _short_sides(upright, upright_valid, step_mm, length_mm, length_tolerance)
 
     half_width = (bottom_line[0] - top_line[0]) / 2 * np.cos(np.arctan(slope))
+    if abs(2 * half_width * step_mm / width_mm - 1) > width_tolerance:
+        raise _wrong_scale(pixel_mm, 2 * half_width * step_mm, width_mm)
     along = (left + right) / 2 - middle
     c, s = np.cos(np.arctan(slope)), np.sin(np.arctan(slope))
     origin = np.array([middle, (top_line[0] + bottom_line[0]) / 2])
@@ -168,7 +173,7 @@ def _steps(image: ByteArray, valid: BoolArray, *, axis: int) -> Float32Array:
 
 
 def _long_sides(
-    across: Float32Array, step_mm: float, width_mm: float, tolerance: float, length_mm: float
+    across: Float32Array, step_mm: float, width_mm: float, tolerance: float, length_mm: float, pixel_mm: float
 ) -> tuple[float, float, float]:
     """Slope and the rows (at the middle column) of the two lines that look most like the long sides."""
     rows, columns = across.shape
@@ -178,9 +183,10 @@ def _long_sides(
     # A block counts with the square root of its step: many weak places outweigh a few strong ones.
     blocks = np.sign(blocks) * np.sqrt(np.abs(blocks))
     x = (np.arange(count) + 0.5) * block - 0.5 - (columns - 1) / 2
-    best = (-np.inf, 0.0, 0.0, 0.0)
+    best, other = (-np.inf, 0.0, 0.0, 0.0), (-np.inf, 0)
     limit = np.tan(np.radians(_TILT_LIMIT_DEG))
     low, high = (int(width_mm * (1 + sign * tolerance) / step_mm) for sign in (-1, 1))
+    least, most = int(low * (1 - _WRONG_SCALE)), min(int(high * (1 + _WRONG_SCALE)), rows - 1)
     for slope in np.arange(-limit, limit, 0.5 * step_mm / (length_mm / 2)):
         shift = np.rint(slope * x).astype(int)
         source = np.arange(rows)[:, None] + shift
@@ -192,8 +198,21 @@ def _long_sides(
             row = int(pair.argmax())
             if pair[row] > best[0]:
                 best = (float(pair[row]), float(slope), float(row), float(row + distance))
+        for distance in (*range(least, low), *range(high + 1, most + 1)):
+            height = float((profile[: rows - distance] - profile[distance:]).max())
+            if height > other[0]:
+                other = (height, distance)
+    if other[0] > _CLEARLY * best[0]:
+        raise _wrong_scale(pixel_mm, other[1] * step_mm, width_mm)
     # The step at index i lies between rows i and i + 1.
     return best[1], best[2] + 0.5, best[3] + 0.5
+
+
+def _wrong_scale(pixel_mm: float, found_mm: float, width_mm: float) -> InputError:
+    return InputError(
+        f"with pixels of {1000 * pixel_mm:g} um the long sides of the format are {found_mm:.1f} mm apart; "
+        f"{width_mm:.1f} mm are needed: is pixel_um right?"
+    )
 
 
 def _fit_line(

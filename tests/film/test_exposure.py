@@ -112,6 +112,12 @@ def test_two_dark_ends_are_not_taken_for_the_ends_of_the_format(film):
     assert 5.0 < found.centre_sd_mm[0] < 30.0
 
 
+@pytest.mark.parametrize("wrong", [0.85, 0.93, 1.08, 1.2])
+def test_a_wrong_size_of_pixels_is_asked_about(film, wrong):
+    with pytest.raises(InputError, match="is pixel_um right"):
+        find_exposure(block_mean(film.image, 2), pixel_mm=film.pixel_mm * wrong, factor=2, **FORMAT)
+
+
 def test_a_film_without_a_format_is_refused():
     noise = np.random.default_rng(0).integers(18, 26, (280, 2900)).astype(np.uint8)
     with pytest.raises(InputError, match="long sides of the format"):
