@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +149,16 @@ class Project:
         """Scenes of a block that belong to a pair, in the order of the sheet."""
         paired = {scene for pair in self.pairs.values() for scene in (pair.fore, pair.aft)}
         return [name for name, scene in self.scenes.items() if scene.block == block and name in paired]
+
+    def neighbours_of_block(self, block: str) -> list[tuple[str, str]]:
+        """Frames of a block that follow each other on the film of one camera, two by two."""
+        scenes = [self.scenes[name] for name in self.scenes_of_block(block)]
+        frames = sorted((scene.id.flight, scene.look, int(scene.id.frame), scene.scene) for scene in scenes)
+        return [
+            (first, second)
+            for (*camera, number, first), (*same, following, second) in pairwise(frames)
+            if same == camera and following == number + 1
+        ]
 
     def scenes_of_site(self, site: str) -> list[str]:
         """Scenes of a site that belong to a pair, in the order of the sheet."""

@@ -204,6 +204,11 @@ def site_of(project: Project, wildcards: Mapping[str, str] | Any) -> str:
     return named["site"] if "site" in named else scenes_of(project, wildcards)[0].site
 
 
+def is_alone(project: Project, wildcards: Mapping[str, str] | Any) -> bool:
+    """Whether the pair of a job's scene has no other pair in its block, whose frames could carry it."""
+    return len(project.pairs_of_block(scenes_of(project, wildcards)[0].block)) < 2
+
+
 def largest_film_mpx(project: Project, wildcards: Mapping[str, str] | Any) -> float:
     """Size of the largest film that a job touches, millions of pixels."""
     return max(film_mpx(scene) for scene in scenes_of(project, wildcards))

@@ -16,6 +16,8 @@ wildcard_constraints:
     scene=house.any_of(project.scenes),
     pair=house.any_of(project.pairs),
     block=house.any_of({scene.block for scene in project.scenes.values()}),
+    first=house.any_of(project.scenes),
+    second=house.any_of(project.scenes),
     look="fore|aft",
     aft="|_aft",
 
@@ -129,6 +131,24 @@ def members_of_site_pairs(wildcards):
         [project.pairs[pair].fore, project.pairs[pair].aft, project.block_of(pair)]
         for pair in project.pairs_of_site(wildcards.site)
     ]
+
+
+def neighbours_of_block(wildcards):
+    """Frames of a block that follow each other in one camera, two by two."""
+    return project.neighbours_of_block(wildcards.block)
+
+
+def of_neighbours(pattern):
+    """Function that gives a file of all neighbouring frames of a block."""
+    return lambda wildcards: [
+        pattern.format(block=wildcards.block, first=first, second=second)
+        for first, second in neighbours_of_block(wildcards)
+    ]
+
+
+def is_alone(wildcards):
+    """Whether a scene or pair has no other pair in its block, whose frames could carry it."""
+    return house.is_alone(project, wildcards)
 
 
 def of_block(pattern):

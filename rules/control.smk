@@ -131,6 +131,7 @@ rule collect_gcps:
         **choices("collect_gcps"),
         library=house.script_digest("collect_gcps"),
         reference_dem_heights=of_site("reference_dem_heights"),
+        needed=is_alone,
     message:
         "Choosing ground control of {wildcards.scene}"
     script:
@@ -139,10 +140,10 @@ rule collect_gcps:
 
 rule match_pair:
     input:
-        fore_film=film_of("fore", "film.tif"),
-        aft_film=film_of("aft", "film.tif"),
-        fore_footprint=film_of("fore", "footprint.json"),
-        aft_footprint=film_of("aft", "footprint.json"),
+        first_film=film_of("fore", "film.tif"),
+        second_film=film_of("aft", "film.tif"),
+        first_footprint=film_of("fore", "footprint.json"),
+        second_footprint=film_of("aft", "footprint.json"),
         reference_dem=of_site("reference_dem"),
     output:
         tie_points="results/pairs/{pair}/tie_points.parquet",
@@ -161,7 +162,41 @@ rule match_pair:
         **choices("match_pair"),
         library=house.script_digest("match_pair"),
         reference_dem_heights=of_site("reference_dem_heights"),
+        names=["fore", "aft"],
+        needed=is_alone,
     message:
         "Matching fore with aft of {wildcards.pair}"
+    script:
+        "../scripts/match_pair.py"
+
+
+rule match_neighbours:
+    input:
+        first_film="results/scenes/{first}/film.tif",
+        second_film="results/scenes/{second}/film.tif",
+        first_footprint="results/scenes/{first}/footprint.json",
+        second_footprint="results/scenes/{second}/footprint.json",
+        reference_dem=of_site("reference_dem"),
+    output:
+        tie_points="results/blocks/{block}/neighbours/{first}_{second}.parquet",
+        summary="results/blocks/{block}/neighbours/{first}_{second}.json",
+    log:
+        "logs/match_neighbours/{block}_{first}_{second}.log",
+    benchmark:
+        "benchmarks/match_neighbours/{block}_{first}_{second}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=memory(2),
+        runtime=runtime(3),
+    params:
+        **choices("match_pair"),
+        library=house.script_digest("match_pair"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+        names=["first", "second"],
+        needed=False,
+    message:
+        "Matching {wildcards.first} with its neighbour {wildcards.second}"
     script:
         "../scripts/match_pair.py"

@@ -31,6 +31,9 @@ rule adjust_bundle:
         footprints=of_block("results/scenes/{scene}/footprint.json"),
         films=of_block("results/scenes/{scene}/film.json"),
         tie_points=of_pairs_of_block("results/pairs/{pair}/tie_points.parquet"),
+        neighbour_points=of_neighbours(
+            "results/blocks/{block}/neighbours/{first}_{second}.parquet"
+        ),
         reference_dem=of_site("reference_dem"),
         unstable_terrain=site_file("unstable_terrain"),
     output:
@@ -68,6 +71,7 @@ rule adjust_bundle:
         scenes=scenes_of_block,
         pairs=members_of_block_pairs,
         pair_names=pairs_of_block,
+        neighbours=neighbours_of_block,
     message:
         "Adjusting the cameras of {wildcards.block}"
     script:

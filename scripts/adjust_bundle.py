@@ -26,6 +26,7 @@ HEIGHT_SIGMA_MM = 10.0  # posting of the standard deviation of heights
 def adjust_bundle(
     gcp_paths,
     tie_paths,
+    neighbour_paths,
     footprint_paths,
     film_paths,
     reference_dem_path,
@@ -41,12 +42,14 @@ def adjust_bundle(
     scenes,
     pairs,
     pair_names,
+    neighbours,
     reference_dem_heights,
     model,
     knots_along_mm,
     knots_across_mm,
     correlation_lengths_mm,
     reference_sigma_m,
+    reference_smooth_sigma_m,
     reference_sigma_horizontal_m,
     max_slope_deg,
     film_distortion_um,
@@ -57,9 +60,12 @@ def adjust_bundle(
     grid_radius_mm,
 ):
     gcps = [tables.read(path) for path in gcp_paths]
-    tie_tables = [tables.read(path) for path in tie_paths]
     pixels_mm = [records.read_json(path)["pixel_mm"] for path in film_paths]
-    placed = [camera_of_footprint(path) for path in footprint_paths]
+    footprints = [records.read_json(path) for path in footprint_paths]
+    placed = [
+        records.from_plain(footprint["camera"], PanoramicCamera, str(path))
+        for footprint, path in zip(footprints, footprint_paths, strict=True)
+    ]
     origin = common_origin(placed)
     cameras = [camera.moved_to(origin) for camera in placed]
 
@@ -70,9 +76,13 @@ def adjust_bundle(
         ]
         for role in ("control", "check")
     )
-    ties = [
-        tie_points(table, scenes.index(fore), scenes.index(aft), pixels_mm[scenes.index(fore)])
-        for table, (fore, aft) in zip(tie_tables, pairs, strict=True)
+    stereo = [
+        tie_points(tables.read(path), ("fore", "aft"), scenes.index(fore), scenes.index(aft), pixels_mm)
+        for path, (fore, aft) in zip(tie_paths, pairs, strict=True)
+    ]
+    ties = stereo + [
+        tie_points(tables.read(path), ("first", "second"), scenes.index(first), scenes.index(second), pixels_mm)
+        for path, (first, second) in zip(neighbour_paths, neighbours, strict=True)
     ]
     held_out = [
         precision.in_held_out_blocks(points.first_mm, control[points.first].film_mm, checks[points.first].film_mm)
@@ -86,7 +96,13 @@ def adjust_bundle(
     )
     field = FieldChoices(knots_along_mm, knots_across_mm, tuple(correlation_lengths_mm)) if model == "field" else None
     film_groups = [int(scene in {aft for _, aft in pairs}) for scene in scenes]
-    choices = {"field": field, "reference": reference, "gate_sigma": gate_sigma, "film_groups": film_groups}
+    choices = {
+        "field": field,
+        "reference": reference,
+        "gate_sigma": gate_sigma,
+        "film_groups": film_groups,
+        "place_sigmas_m": [footprint.get("sigma_m", np.nan) for footprint in footprints],
+    }
 
     block = blocks.orient_block(
         cameras,
@@ -119,14 +135,15 @@ def adjust_bundle(
     for camera in final.adjustment.cameras:
         records.write(Path(cameras_folder) / f"{camera.scene}.json", camera)
         write_field(Path(fields_folder) / f"{camera.scene}.tif", camera)
-    for name, (fore, aft), points in zip(pair_names, pairs, ties, strict=True):
+    for name, (fore, aft), points in zip(pair_names, pairs, stereo, strict=True):
         sigma = height_sigma(
             final.adjustment.cameras,
             scenes.index(fore),
             scenes.index(aft),
             covariance=final.adjustment.covariance,
             calibration=final.calibration,
-            film_sigma_mm=0.0 if field else film_distortion_um / 1000.0,
+            film_sigma_mm=final.calibration.unmodelled_mm if field else film_distortion_um / 1000.0,
+            reference_sigma_m=reference_smooth_sigma_m if field else 0.0,
             height_m=mean_height_m(final.adjustment, points),
             step_mm=HEIGHT_SIGMA_MM,
         )
@@ -155,10 +172,6 @@ def adjust_bundle(
     records.write(summary_path, summary)
 
 
-def camera_of_footprint(path):
-    return records.from_plain(records.read_json(path)["camera"], PanoramicCamera, str(path))
-
-
 def common_origin(cameras):
     """The middle of the footprints, on the ellipsoid."""
     centres = np.mean([camera.locate_geodetic(np.zeros(2), 0.0) for camera in cameras], axis=0)
@@ -176,13 +189,14 @@ def control_points(table, origin, pixel_mm):
     )
 
 
-def tie_points(table, first, second, pixel_mm):
+def tie_points(table, names, first, second, pixels_mm):
     return Ties(
         first=first,
         second=second,
-        first_mm=table[["fore_x_mm", "fore_y_mm"]].to_numpy(),
-        second_mm=table[["aft_x_mm", "aft_y_mm"]].to_numpy(),
-        sigma_mm=table.sigma_px.to_numpy() * pixel_mm,
+        first_mm=table[[f"{names[0]}_x_mm", f"{names[0]}_y_mm"]].to_numpy(),
+        second_mm=table[[f"{names[1]}_x_mm", f"{names[1]}_y_mm"]].to_numpy(),
+        sigma_mm=table.sigma_px.to_numpy() * pixels_mm[first],
+        neighbours=names == ("first", "second"),
     )
 
 
@@ -223,6 +237,8 @@ def check_errors(adjustment, checks, ties, held_out, reference, gate_sigma):
     origin = adjustment.cameras[0].origin
     found = [np.empty((0, 3))]
     for points, weights, chosen in zip(ties, adjustment.tie_weights, held_out, strict=True):
+        if points.neighbours:
+            continue
         ground, _ = precision.intersect(adjustment.cameras, points)
         found.append(origin.geodetic_from_local(ground[chosen & (weights > 0)]))
     lonlath = np.concatenate(found)
@@ -306,7 +322,7 @@ def tie_residuals(cameras, ties, weights, pixels_mm):
             pd.DataFrame(
                 {
                     "scene": cameras[image].scene,
-                    "group": "tie",
+                    "group": "neighbour" if ties.neighbours else "tie",
                     "role": np.where(weights > 0, "tie", "rejected"),
                     "x_mm": film[:, 0],
                     "y_mm": film[:, 1],
@@ -348,6 +364,7 @@ if __name__ == "__main__":
         adjust_bundle(
             gcp_paths=list(snakemake.input.gcps),
             tie_paths=list(snakemake.input.tie_points),
+            neighbour_paths=list(snakemake.input.neighbour_points),
             footprint_paths=list(snakemake.input.footprints),
             film_paths=list(snakemake.input.films),
             reference_dem_path=snakemake.input.reference_dem,
@@ -362,12 +379,14 @@ if __name__ == "__main__":
             scenes=snakemake.params.scenes,
             pairs=snakemake.params.pairs,
             pair_names=snakemake.params.pair_names,
+            neighbours=snakemake.params.neighbours,
             reference_dem_heights=snakemake.params.reference_dem_heights,
             model=snakemake.params.model,
             knots_along_mm=snakemake.params.knots_along_mm,
             knots_across_mm=snakemake.params.knots_across_mm,
             correlation_lengths_mm=snakemake.params.correlation_lengths_mm,
             reference_sigma_m=snakemake.params.reference_sigma_m,
+            reference_smooth_sigma_m=snakemake.params.reference_smooth_sigma_m,
             reference_sigma_horizontal_m=snakemake.params.reference_sigma_horizontal_m,
             max_slope_deg=snakemake.params.max_slope_deg,
             film_distortion_um=snakemake.params.film_distortion_um,

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
+from cosp.errors import NotEnoughMatchesError
 from cosp.io import gcps, rasters, records, references, tables, vectors
 from cosp.io.logs import log_to
 from cosp.matching.consistency import places_of, reference_shift
@@ -16,6 +17,14 @@ from cosp.matching.footprint import Footprint
 from cosp.matching.ground import map_crs
 
 log = logging.getLogger("collect_gcps")
+
+# Of a table without points.
+COLUMNS = {
+    **dict.fromkeys(("x_mm", "y_mm", "longitude_deg", "latitude_deg", "height_m"), float),
+    **dict.fromkeys(("role", "source"), object),
+    **dict.fromkeys(("score", "sigma_px", "sigma_ground_m", "sigma_height_m"), float),
+    **dict.fromkeys(("sigma_x_px", "sigma_y_px", "correlation_xy", "residual_x_px", "residual_y_px"), float),
+}
 
 
 def collect_gcps(
@@ -29,6 +38,7 @@ def collect_gcps(
     gcps_path,
     summary_path,
     *,
+    needed=True,
     reference_dem_heights,
     tile_mm,
     gate_px,
@@ -79,36 +89,50 @@ def collect_gcps(
         own = gcps.read(own_gcps_path)
         own = own[own["scene"] == camera.scene].drop(columns="scene").reset_index(drop=True)
         log.info("%d points of %s are on this film", len(own), own_gcps_path)
-    table, summary = collect(
-        pd.concat([tables.read(path) for path in matches_paths], ignore_index=True),
-        film,
-        camera,
-        heights_on=heights_on,
-        unstable_on=partial(vectors.rasterise, unstable_terrain_path, crs=crs) if unstable_terrain_path else None,
-        crs=crs,
-        dem_posting_m=dem_posting_m,
-        reference_shift_m=shift_m,
-        own=own,
-        tile_mm=tile_mm,
-        gate_px=gate_px,
-        min_per_tile=min_per_tile,
-        trials=trials,
-        cell_mm=cell_mm,
-        per_cell=per_cell,
-        max_slope_deg=max_slope_deg,
-        white=white,
-        scratch_grey=scratch_grey,
-        reference_sigma_m=reference_sigma_m,
-        dem_sigma_m=dem_sigma_m,
-        check_columns=check_columns,
-        check_rows=check_rows,
-        min_gcps=min_gcps,
-        rng=np.random.default_rng(seed),
-    )
+    try:
+        table, summary = collect(
+            pd.concat([tables.read(path) for path in matches_paths], ignore_index=True),
+            film,
+            camera,
+            heights_on=heights_on,
+            unstable_on=partial(vectors.rasterise, unstable_terrain_path, crs=crs) if unstable_terrain_path else None,
+            crs=crs,
+            dem_posting_m=dem_posting_m,
+            reference_shift_m=shift_m,
+            own=own,
+            tile_mm=tile_mm,
+            gate_px=gate_px,
+            min_per_tile=min_per_tile,
+            trials=trials,
+            cell_mm=cell_mm,
+            per_cell=per_cell,
+            max_slope_deg=max_slope_deg,
+            white=white,
+            scratch_grey=scratch_grey,
+            reference_sigma_m=reference_sigma_m,
+            dem_sigma_m=dem_sigma_m,
+            check_columns=check_columns,
+            check_rows=check_rows,
+            min_gcps=min_gcps,
+            rng=np.random.default_rng(seed),
+        )
+    except NotEnoughMatchesError as error:
+        if needed:
+            raise
+        log.warning("%s; other frames of the block have to carry it", error)
+        table, summary = (
+            pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in COLUMNS.items()}),
+            no_control(error),
+        )
     tables.write(gcps_path, table)
     records.write(
         summary_path, {"kind": "gcps", "version": 1, "scene": camera.scene, **summary, "reference_shift": shift}
     )
+
+
+def no_control(error):
+    """What is said of a film without control, which other frames of its block have to carry."""
+    return {"control": 0, "check": 0, "rejected": 0, "own": 0, "reason": str(error)}
 
 
 if __name__ == "__main__":
@@ -123,6 +147,7 @@ if __name__ == "__main__":
             own_gcps_path=snakemake.input.get("own_gcps"),
             gcps_path=snakemake.output.gcps,
             summary_path=snakemake.output.summary,
+            needed=snakemake.params.needed,
             reference_dem_heights=snakemake.params.reference_dem_heights,
             tile_mm=snakemake.params.tile_mm,
             gate_px=snakemake.params.gate_px,

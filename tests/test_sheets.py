@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -301,6 +302,23 @@ def test_each_fore_frame_pairs_with_the_aft_frame_six_later() -> None:
     assert [pair.pair for pair in sheets.find_pairs(scenes)] == [
         f"1104-2169_{92 + frame:03d}-{98 + frame:03d}" for frame in range(4)
     ]
+
+
+def test_neighbours_follow_each_other_in_one_camera_and_one_block() -> None:
+    frames = ["DF093", "DF092", "DA098", "DF095", "DA099", "DA100", "DA101", "DF094"]
+    rows = [HEADER, *(_row(f"DS1104-2169{frame}") for frame in frames)]
+    scenes = {scene.scene: scene for scene in _scenes(rows)}
+    elsewhere = "DS1104-2169DF095"
+    scenes[elsewhere] = replace(scenes[elsewhere], block="other")
+    pairs = {pair.pair: pair for pair in sheets.find_pairs(list(scenes.values()))}
+    fore = [f"DS1104-2169DF09{n}" for n in (2, 3, 4)]
+    aft = [f"DS1104-2169DA{n:03d}" for n in (98, 99, 100)]
+    project = sheets.Project({}, scenes, {name: pair for name, pair in pairs.items() if pair.fore != elsewhere})
+    assert project.neighbours_of_block("1104-2169") == [
+        *((aft[n], aft[n + 1]) for n in range(2)),
+        *((fore[n], fore[n + 1]) for n in range(2)),
+    ]
+    assert project.neighbours_of_block("other") == []
 
 
 def test_overlap_decides_where_the_frames_are_not_six_apart() -> None:

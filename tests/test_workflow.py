@@ -179,3 +179,12 @@ def test_blocks_are_exported_where_a_form_is_asked_for(formats: list[str], block
     scenes = {scene.scene: scene for scene in (*fore, *aft)}
     project = sheets.Project({"export_cameras": {"formats": formats}}, scenes, pairs)
     assert workflow.blocks_to_export(project) == blocks
+
+
+def test_a_pair_is_alone_where_no_other_pair_is_in_its_block() -> None:
+    fore = [replace(_scene(), scene=f"DS1104-2169DF09{i}", block=block) for i, block in enumerate("aab")]
+    aft = [replace(_scene(), scene=f"DS1104-2169DA09{i}", block=block) for i, block in enumerate("aab")]
+    pairs = {f"p{i}": sheets.Pair(f"p{i}", fore[i].scene, aft[i].scene) for i in range(3)}
+    project = sheets.Project({}, {scene.scene: scene for scene in (*fore, *aft)}, pairs)
+    assert [workflow.is_alone(project, {"pair": pair}) for pair in pairs] == [False, False, True]
+    assert [workflow.is_alone(project, {"scene": scene.scene}) for scene in aft] == [False, False, True]

@@ -12,10 +12,21 @@ import numpy as np
 from cosp.adjustment import precision
 from cosp.adjustment.bundle import CONTROL_NEEDED, Adjustment, adjust
 from cosp.adjustment.calibration import Calibration, FieldChoices, calibrate
-from cosp.adjustment.observations import FIELD_PRIORS, PLAIN_PRIORS, Control, HeightReference, Ties, orbit_coupling
+from cosp.adjustment.carrying import carry
+from cosp.adjustment.observations import (
+    FIELD_PRIORS,
+    PLAIN_PRIORS,
+    Control,
+    HeightReference,
+    Ties,
+    orbit_coupling,
+    place_information,
+)
+from cosp.adjustment.posterior import place_sigma_m
 from cosp.adjustment.robust import Resection, resect
 from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
+from cosp.errors import NotEnoughMatchesError
 from cosp.geometry.statistics import nmad, rms, summarise
 
 PointsT = TypeVar("PointsT", Control, Ties)
@@ -79,12 +90,17 @@ def orient_block(
     reference: HeightReference | None = None,
     held_out: Sequence[BoolArray] | None = None,
     film_groups: Sequence[int] | None = None,
+    place_sigmas_m: Sequence[float] | None = None,
 ) -> OrientedBlock:
     """Adjusted cameras of a block.
 
     Every image with control enough is first oriented by itself, with both scan directions tried; that finds the
-    gross errors of its control and a start that tie points can be trusted with. Then all are adjusted together. The
+    gross errors of its control and a start that tie points can be trusted with. Images without control are set up on
+    the ground that their neighbours show. Then all are adjusted together. The
     cameras given stay the means of the priors. Last, if asked for, the distortion of the films joins the unknowns.
+
+    Where an image has no control, its tie points are held to the reference's heights from the beginning, and to where
+    the image was placed; so are those between neighbouring frames, whose rays alone would not say where they meet.
 
     Parameters
     ----------
@@ -105,12 +121,21 @@ def orient_block(
         Tie points whose height is kept from the adjustment.
     film_groups : sequence of int
         Which images were taken by the same camera.
+    place_sigmas_m : sequence of float
+        How well each image was placed on the ground; used for those without control. NaN where that is not known.
 
     Raises
     ------
     NotEnoughMatchesError
-        If the block has too little control.
+        If the block has too little control, or an image without control too few tie points.
     """
+    found_control = sum(len(points) for points in control)
+    if found_control < CONTROL_NEEDED:
+        scenes = ", ".join(camera.scene for camera in cameras)
+        raise NotEnoughMatchesError(
+            f"{scenes}: {found_control} of the {CONTROL_NEEDED} control points that a block needs; with no frame on "
+            "known ground, none can be carried"
+        )
     allowed = [_allowing(points, film_distortion_mm) for points in control]
     resections = [
         resect(
@@ -128,16 +153,30 @@ def orient_block(
         else None
         for camera, points in zip(cameras, allowed, strict=True)
     ]
-    start = [resection.camera if resection else camera for camera, resection in zip(cameras, resections, strict=True)]
+    alone = np.array([resection is None for resection in resections])
+    information = _information(cameras, control, film_groups, place_sigmas_m)
+    tie_allowed = [_allowing(points, tie_distortion_mm) for points in ties]
+    start = carry(
+        cameras,
+        resections,
+        [_allowing(points, film_distortion_mm) for points in ties],
+        reference=reference,
+        priors=FIELD_PRIORS,
+        gate_sigma=gate_sigma,
+        information=information,
+    )
     means = [replace(camera, scan_direction=found.scan_direction) for camera, found in zip(cameras, start, strict=True)]
     plain = adjust(
         start,
         allowed,
-        [_allowing(points, tie_distortion_mm) for points in ties],
+        tie_allowed,
         priors=PLAIN_PRIORS,
         gate_sigma=gate_sigma,
         prior_cameras=means,
         start_sigma=SECOND_START_SIGMA,
+        information=information if alone.any() else None,
+        reference=reference,
+        to_reference=[_held(points, alone, None if held_out is None else held_out[n]) for n, points in enumerate(ties)],
     )
     if field is None:
         return OrientedBlock(plain, tuple(resections), None, plain)
@@ -152,9 +191,10 @@ def orient_block(
         gate_sigma=gate_sigma,
         control_weights=plain.control_weights,
         tie_weights=plain.tie_weights,
+        height_weights=plain.height_weights,
         held_out=held_out,
         film_groups=film_groups,
-        coupling=_coupling(cameras, film_groups),
+        coupling=information,
     )
     return OrientedBlock(_with_fields(calibration), tuple(resections), calibration, plain)
 
@@ -170,6 +210,7 @@ def with_checks(
     reference: HeightReference | None,
     gate_sigma: float,
     film_groups: Sequence[int] | None = None,
+    place_sigmas_m: Sequence[float] | None = None,
 ) -> OrientedBlock:
     """The block adjusted once more with its check points as control and no height held out.
 
@@ -184,7 +225,7 @@ def with_checks(
         Per image.
     ties : sequence of Ties
     prior_cameras : sequence of PanoramicCamera
-    field, reference, gate_sigma, film_groups
+    field, reference, gate_sigma, film_groups, place_sigmas_m
         As for `orient_block`.
     """
     if block.calibration is None:
@@ -201,13 +242,33 @@ def with_checks(
         choices=replace(field, lengths_mm=(block.calibration.prior.length_mm,)),
         gate_sigma=gate_sigma,
         film_groups=film_groups,
-        coupling=_coupling(cameras, film_groups),
+        coupling=_information(prior_cameras, control, film_groups, place_sigmas_m),
+        learned=block.calibration,
     )
     return replace(block, adjustment=_with_fields(calibration), calibration=calibration)
 
 
-def _coupling(cameras: Sequence[PanoramicCamera], film_groups: Sequence[int] | None) -> FloatArray | None:
-    return None if film_groups is None else orbit_coupling([camera.scene for camera in cameras], film_groups)
+def _held(points: Ties, alone: BoolArray, held_out: BoolArray | None) -> BoolArray:
+    """Which tie points the reference's heights hold from the beginning; `alone` are the images without control."""
+    wanted = points.neighbours or bool(alone[[points.first, points.second]].any())
+    held: BoolArray = np.full(len(points), wanted)
+    return held if held_out is None else held & ~held_out
+
+
+def _information(
+    cameras: Sequence[PanoramicCamera],
+    control: Sequence[Control],
+    film_groups: Sequence[int] | None,
+    place_sigmas_m: Sequence[float] | None,
+) -> FloatArray:
+    """What is believed of the cameras together (13 n, 13 n): one orbit, and places of frames without control."""
+    groups = film_groups if film_groups is not None else range(len(cameras))
+    information = orbit_coupling([camera.scene for camera in cameras], list(groups))
+    for i, (camera, points) in enumerate(zip(cameras, control, strict=True)):
+        if place_sigmas_m is not None and len(points) < CONTROL_NEEDED and np.isfinite(place_sigmas_m[i]):
+            mine = slice(13 * i, 13 * (i + 1))
+            information[mine, mine] += place_information(camera, place_sigmas_m[i])
+    return information
 
 
 def _allowing(points: PointsT, distortion_mm: float) -> PointsT:
@@ -231,6 +292,8 @@ def _with_fields(calibration: Calibration) -> Adjustment:
         cameras=calibration.cameras,
         control_weights=calibration.weights[:images],
         tie_weights=calibration.weights[images : images + ties],
+        height_weights=calibration.weights[images + ties :]
+        or tuple(np.zeros(len(w)) for w in calibration.weights[images:]),
         covariance=calibration.covariance[np.ix_(columns, columns)],
         sigma_naught=math.sqrt(square / max(calibration.redundancy, 1.0)),
         redundancy=round(calibration.redundancy),
@@ -332,25 +395,31 @@ def summary(
             "paper_parameters": precision.paper_parameters(adjusted),
             "correlations": correlation,
             "film_field": _field_size(adjusted),
+            "place_sigma_m": place_sigma_m(
+                adjusted, n, covariance=final.adjustment.covariance, calibration=final.calibration, height_m=0.0
+            ),
         }
-        for camera, adjusted, points, weights, held_out, resection, correlation, size_mm in zip(
-            cameras,
-            final.adjustment.cameras,
-            control,
-            adjustment.control_weights,
-            checks,
-            block.resections,
-            correlated,
-            pixels_mm,
-            strict=True,
+        for n, (camera, adjusted, points, weights, held_out, resection, correlation, size_mm) in enumerate(
+            zip(
+                cameras,
+                final.adjustment.cameras,
+                control,
+                adjustment.control_weights,
+                checks,
+                block.resections,
+                correlated,
+                pixels_mm,
+                strict=True,
+            )
         )
     ]
-    pairs = []
+    pairs: list[dict[str, Any]] = []
+    neighbours: list[dict[str, Any]] = []
     for points, weights in zip(ties, adjustment.tie_weights, strict=True):
         ground, gap_m = precision.intersect(cameras, points)
         first, second = precision.tie_residuals(cameras, points, ground)
         kept = weights > 0
-        pairs.append(
+        (neighbours if points.neighbours else pairs).append(
             {
                 "first": cameras[points.first].scene,
                 "second": cameras[points.second].scene,
@@ -380,7 +449,9 @@ def summary(
         "redundancy": adjustment.redundancy,
         "iterations": adjustment.iterations,
         "pixel_mm": pixel_mm,
-        "film_field": None if calibration is None else asdict(calibration.prior),
+        "film_field": None
+        if calibration is None
+        else {**asdict(calibration.prior), "unmodelled_mm": calibration.unmodelled_mm},
         "groups": precision.group_statistics(*groups, scales),
         "check": {
             "rmse": _rmse(errors),
@@ -394,6 +465,7 @@ def summary(
         },
         "images": images,
         "pairs": pairs,
+        "neighbours": neighbours,
         "priors": asdict(PLAIN_PRIORS if calibration is None else FIELD_PRIORS),
         "origin": asdict(cameras[0].origin),
     }

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosp.adjustment.observations import Control, Priors, Ties
-from cosp.adjustment.rows import Rows, control_rows, intersections, tie_rows
+from cosp.adjustment.observations import Control, HeightReference, Priors, Ties
+from cosp.adjustment.rows import Rows, control_rows, height_rows, intersections, tie_rows
 from cosp.adjustment.solver import START_SIGMA, Equations, Solution, minimise
-from cosp.arrays import FloatArray
+from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import NotEnoughMatchesError
 
@@ -29,6 +29,8 @@ class Adjustment:
         Per image; 0 marks a gross error.
     tie_weights : tuple of (N,) arrays
         Per set of tie points.
+    height_weights : tuple of (N,) arrays
+        Of the reference heights of the sets of tie points that were held to them; 0 for the others.
     covariance : (13 n, 13 n) array
         Of the parameters of all images, at a variance factor of one.
     sigma_naught : float
@@ -41,6 +43,7 @@ class Adjustment:
     cameras: tuple[PanoramicCamera, ...]
     control_weights: tuple[FloatArray, ...]
     tie_weights: tuple[FloatArray, ...]
+    height_weights: tuple[FloatArray, ...]
     covariance: FloatArray
     sigma_naught: float
     redundancy: int
@@ -57,6 +60,9 @@ def adjust(
     gate_sigma: float,
     prior_cameras: Sequence[PanoramicCamera] | None = None,
     start_sigma: float = START_SIGMA,
+    information: FloatArray | None = None,
+    reference: HeightReference | None = None,
+    to_reference: Sequence[BoolArray] | None = None,
 ) -> Adjustment:
     """Cameras of a block from control and tie points.
 
@@ -78,6 +84,11 @@ def adjust(
         Means of the priors; the start values if left out.
     start_sigma : float
         First width of the robust weights, standard deviations.
+    information : (13 n, 13 n) array
+        What else is believed of the cameras, about `prior_cameras`.
+    reference : HeightReference
+    to_reference : sequence of (N,) arrays of bool
+        Tie points that are held to the heights of the reference; none if left out.
 
     Raises
     ------
@@ -100,10 +111,11 @@ def adjust(
         scenes = ", ".join(camera.scene for camera in cameras)
         raise NotEnoughMatchesError(f"{scenes}: {found} of the {needed} control points needed")
 
-    information = np.zeros((PARAMETERS * len(cameras),) * 2)
+    information = np.zeros((PARAMETERS * len(cameras),) * 2) if information is None else information.copy()
     for i, camera in enumerate(prior_cameras or cameras):
         block = slice(PARAMETERS * i, PARAMETERS * (i + 1))
-        information[block, block] = priors.information(camera)
+        information[block, block] += priors.information(camera)
+    held = [n for n in range(len(ties)) if reference and to_reference is not None and to_reference[n].any()]
 
     def cameras_of(unknowns: FloatArray) -> list[PanoramicCamera]:
         rows = unknowns.reshape(-1, PARAMETERS)
@@ -115,7 +127,10 @@ def adjust(
             control_equations(camera, points, first_column=PARAMETERS * i)
             for i, (camera, points) in enumerate(zip(now, control, strict=True))
         ]
-        return groups + [tie_equations(now, points) for points in ties]
+        groups += [tie_equations(now, points) for points in ties]
+        if reference is not None and to_reference is not None:
+            groups += [height_equations(now, ties[n], reference, to_reference[n]) for n in held]
+        return groups
 
     solution = minimise(
         linearise,
@@ -125,7 +140,7 @@ def adjust(
         gate_sigma=gate_sigma,
         start_sigma=start_sigma,
     )
-    return _adjustment(cameras_of(solution.unknowns), solution, information)
+    return _adjustment(cameras_of(solution.unknowns), [len(points) for points in ties], held, solution, information)
 
 
 def control_equations(camera: PanoramicCamera, control: Control, first_column: int = 0) -> Equations:
@@ -139,6 +154,15 @@ def tie_equations(cameras: Sequence[PanoramicCamera], ties: Ties) -> Equations:
     return _of_cameras(rows, [PARAMETERS * image for image in rows.images])
 
 
+def height_equations(
+    cameras: Sequence[PanoramicCamera], ties: Ties, reference: HeightReference, chosen: BoolArray
+) -> Equations:
+    """Whitened equations that hold the chosen tie points to the reference's heights: one per point."""
+    rows = height_rows(intersections(cameras, ties), ties, cameras, reference)
+    rows.residuals[~chosen] = np.nan
+    return _of_cameras(rows, [PARAMETERS * image for image in rows.images])
+
+
 def _of_cameras(rows: Rows, first_columns: Sequence[int]) -> Equations:
     jacobian = rows.by_camera()
     return Equations(
@@ -148,7 +172,10 @@ def _of_cameras(rows: Rows, first_columns: Sequence[int]) -> Equations:
     )
 
 
-def _adjustment(cameras: list[PanoramicCamera], solution: Solution, information: FloatArray) -> Adjustment:
+def _adjustment(
+    cameras: list[PanoramicCamera], ties: list[int], held: list[int], solution: Solution, information: FloatArray
+) -> Adjustment:
+    """`ties` are the sizes of the sets of tie points, `held` the sets that were held to the reference."""
     used = [int((weight > 0).sum()) for weight in solution.weights]
     equations = sum(count * group.residuals.shape[1] for count, group in zip(used, solution.equations, strict=True))
     scale = 1.0 / np.sqrt(np.diag(solution.normal))
@@ -161,10 +188,14 @@ def _adjustment(cameras: list[PanoramicCamera], solution: Solution, information:
         for weight, group in zip(solution.weights, solution.equations, strict=True)
     )
     images = len(cameras)
+    heights: list[FloatArray] = [np.zeros(count) for count in ties]
+    for n, weight in zip(held, solution.weights[images + len(ties) :], strict=True):
+        heights[n] = weight
     return Adjustment(
         cameras=tuple(cameras),
         control_weights=tuple(solution.weights[:images]),
-        tie_weights=tuple(solution.weights[images:]),
+        tie_weights=tuple(solution.weights[images : images + len(ties)]),
+        height_weights=tuple(heights),
         covariance=covariance,
         sigma_naught=float(np.sqrt(square / redundancy)),
         redundancy=redundancy,

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 
 from cosp.adjustment import fieldprior, kernels
 from cosp.adjustment.observations import Control, HeightReference, Priors, Ties
@@ -27,10 +29,13 @@ LEARNING_ITERATIONS = 3  # after these the prior and the scales stay, so that th
 SETTLED = 1e-2  # rms movement of the observations, in standard deviations
 HUBER_SIGMA = 2.0
 BELIEF_IN_SIGMAS = 20.0  # observations' worth of belief that the given sigmas are right
-SCALE_LIMITS = (0.5, 5.0)
+SCALE_LIMITS = (0.05, 5.0)
+CELL_MM = 10.0  # of film; errors of points within one may be alike
+CELLS_NEEDED = 30
 UNITS_LEARNED_FROM = 3  # pairs that tell length and amplitude of a large block
 SHARES = (0.0, 0.3, 0.6, 0.85, 0.95)
 FRAMES_TO_SHARE = 3  # of one camera, before a common part can be told from their own
+FRAMES_COMPARED = 4  # of each camera, to tell it
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,9 @@ class Calibration:
     redundancy : float
     cost : float
     iterations : int
+    unmodelled_mm : float
+        Standard deviation per film axis of what moves heights alike within a cell of film and is too short for the
+        field: flutter of the scan, what is left of bending.
     """
 
     cameras: tuple[PanoramicCamera, ...]
@@ -104,6 +112,7 @@ class Calibration:
     redundancy: float
     cost: float
     iterations: int
+    unmodelled_mm: float
 
     @property
     def unknowns(self) -> int:
@@ -128,9 +137,11 @@ def calibrate(
     gate_sigma: float,
     control_weights: Sequence[FloatArray] | None = None,
     tie_weights: Sequence[FloatArray] | None = None,
+    height_weights: Sequence[FloatArray] | None = None,
     held_out: Sequence[BoolArray] | None = None,
     film_groups: Sequence[int] | None = None,
     coupling: FloatArray | None = None,
+    learned: Calibration | None = None,
 ) -> Calibration:
     """Film fields and cameras of a block that is already adjusted without them.
 
@@ -153,14 +164,17 @@ def calibrate(
     choices : FieldChoices
     gate_sigma : float
         Points beyond this many standard deviations are gross errors.
-    control_weights, tie_weights : sequences of (N,) arrays
-        Robust weights of the adjustment before fields; 0 marks gross errors. Not needed to go on with fields.
+    control_weights, tie_weights, height_weights : sequences of (N,) arrays
+        Robust weights of the adjustment before fields; 0 marks gross errors, and heights that are not yet to be used.
+        Not needed to go on with fields.
     held_out : sequence of (N,) arrays of bool
         Tie points whose height is kept from the adjustment, to be checked with.
     film_groups : sequence of int
         Which images were taken by the same camera; such frames share part of their distortion. None do if left out.
     coupling : (13 n, 13 n) array
         Information that ties the parameters of different images together, about `prior_cameras`.
+    learned : Calibration
+        Of much the same block: its prior and scales are taken over.
 
     Raises
     ------
@@ -186,21 +200,23 @@ def calibrate(
 
     going_on = all(camera.film_field is not None for camera in cameras)
     now = list(cameras) if going_on else [replace(camera, film_field=flat) for camera in cameras]
-    scales = dict.fromkeys(KINDS, 1.0)
-    prior = FieldPrior(choices.lengths_mm[0], fieldprior.EXPECTED_AMPLITUDE_MM, 0.0)
+    scales = learned.scales if learned else dict.fromkeys(KINDS, 1.0)
+    prior = learned.prior if learned else FieldPrior(choices.lengths_mm[0], fieldprior.EXPECTED_AMPLITUDE_MM, 0.0)
+    to_learn = 0 if learned else LEARNING_ITERATIONS
     for iteration in range(ITERATIONS):
         near = going_on or iteration > 0
-        rows = _linearise(now, control, ties, reference if near else None, held_out)
+        early = height_weights is not None and any(weight.any() for weight in height_weights)
+        rows = _linearise(now, control, ties, reference if near or early else None, held_out)
         weights = [_weights(group, scales, gate_sigma) for group in rows]
         if not near and control_weights is not None and tie_weights is not None:
-            weights = [*control_weights, *tie_weights]
+            weights = [*control_weights, *tie_weights, *(height_weights or ())][: len(rows)]
         groups = [_Normal.of(group, weight, now) for group, weight in zip(rows, weights, strict=True)]
         away = mean - np.stack([camera.parameters() for camera in now])
         block = _Block(groups, scales, len(now), information, away)
-        learning = iteration < LEARNING_ITERATIONS
+        learning = iteration < to_learn
         if learning:
             prior = block.learn_prior(patterns, film_groups, ties)
-        solved = block.solve(patterns[prior.length_mm], prior, film_groups)
+        solved = block.solve(patterns[prior.length_mm], prior, film_groups, with_covariance=learning and near)
         moved = block.movement(solved, now, patterns[prior.length_mm])
         now = solved.applied(now, patterns[prior.length_mm])
         if learning and near:
@@ -214,8 +230,9 @@ def calibrate(
             " ".join(f"{kind} {scale:.2f}" for kind, scale in scales.items()),
             moved,
         )
-        if iteration >= LEARNING_ITERATIONS and moved < SETTLED:
+        if iteration >= to_learn and moved < SETTLED:
             break
+    solved = block.solve(patterns[prior.length_mm], prior, film_groups, with_covariance=True)
     return _result(now, rows, weights, scales, prior, patterns[prior.length_mm], block, solved, iteration + 1)
 
 
@@ -256,6 +273,7 @@ class _Normal:
     images: tuple[int, ...]
     normal: FloatArray
     right: FloatArray
+    reduced: dict[int, tuple[FloatArray, FloatArray]] = dataclass_field(default_factory=dict)
 
     @classmethod
     def of(cls, rows: Rows, weights: FloatArray, cameras: Sequence[PanoramicCamera]) -> _Normal:
@@ -274,7 +292,12 @@ class _Normal:
         return cls(rows.kind, rows.images, normal, right + normal @ present)
 
     def of_patterns(self, patterns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The same in parameters and weights of patterns."""
+        """The same in parameters and weights of patterns; kept, since it is asked for again and again."""
+        if id(patterns) not in self.reduced:
+            self.reduced[id(patterns)] = self._of_patterns(patterns)
+        return self.reduced[id(patterns)]
+
+    def _of_patterns(self, patterns: FloatArray) -> tuple[FloatArray, FloatArray]:
         by_pattern = np.kron(patterns, np.eye(2))
         width = CAMERA + len(by_pattern)
         blocks = self.normal.reshape(len(self.images), width, len(self.images), width)
@@ -348,7 +371,7 @@ class _Block:
         self, patterns: dict[float, FloatArray], film_groups: Sequence[int] | None, ties: Sequence[Ties]
     ) -> FieldPrior:
         """Length, amplitude and common part with the largest marginal likelihood."""
-        pairs: list[tuple[int, ...]] = [(points.first, points.second) for points in ties]
+        pairs: list[tuple[int, ...]] = [(points.first, points.second) for points in ties if not points.neighbours]
         units = pairs or [(image,) for image in range(self.images)]
         units = sorted(set(units), key=self._control_in, reverse=True)[:UNITS_LEARNED_FROM]
         found = {
@@ -360,8 +383,17 @@ class _Block:
         prior = FieldPrior(length, amplitude, 0.0)
         if film_groups is None or max(np.bincount(film_groups)) < FRAMES_TO_SHARE:
             return prior
+        images = self._frames_to_compare(film_groups)
         tried = [replace(prior, share=share) for share in SHARES]
-        return max(tried, key=lambda one: self._evidence_of_share(patterns[length], one, film_groups))
+        return max(tried, key=lambda one: self._evidence_of_share(patterns[length], one, film_groups, images))
+
+    def _frames_to_compare(self, film_groups: Sequence[int]) -> list[int]:
+        """Of each camera the frames with most control, so many as tell what they have in common."""
+        images: list[int] = []
+        for camera in sorted(set(film_groups)):
+            mine = [image for image in range(self.images) if film_groups[image] == camera]
+            images += sorted(mine, key=lambda image: self._control_in((image,)), reverse=True)[:FRAMES_COMPARED]
+        return sorted(images)
 
     def _control_in(self, unit: tuple[int, ...]) -> float:
         """Information of control on the first film coordinates, as a measure of how much there is."""
@@ -398,39 +430,45 @@ class _Block:
         return fieldprior.log_evidence(reduced, right[fields] - normal[np.ix_(fields, cameras)] @ inner[:, -1])
 
     def _with_priors(
-        self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int] | None
+        self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int] | None, images: Sequence[int]
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Normal equations with the priors, and the logarithm of the determinant of the fields' prior information."""
-        normal, right = self.assemble(patterns, range(self.images))
-        cameras = _camera_columns(self.images, normal)
-        normal[np.ix_(cameras, cameras)] += self.information
-        right[cameras] += self.information @ self.away
-        correlation = np.eye(self.images)
+        """Normal equations of images with the priors, and the log determinant of the fields' prior information."""
+        normal, right = self.assemble(patterns, images)
+        cameras = _camera_columns(len(images), normal)
+        mine = np.concatenate([np.arange(CAMERA) + CAMERA * image for image in images])
+        information = self.information[np.ix_(mine, mine)]
+        normal[np.ix_(cameras, cameras)] += information
+        right[cameras] += information @ self.away[mine]
+        correlation = np.eye(len(images))
         if film_groups is not None and prior.share > 0.0:
-            same = np.equal.outer(film_groups, film_groups)
-            correlation = np.where(same, prior.share, 0.0) + (1.0 - prior.share) * np.eye(self.images)
+            camera = np.asarray(film_groups)[list(images)]
+            same = np.equal.outer(camera, camera)
+            correlation = np.where(same, prior.share, 0.0) + (1.0 - prior.share) * correlation
         precision = np.linalg.inv(correlation) / prior.amplitude_mm**2
-        width = len(normal) // self.images
+        width = len(normal) // len(images)
         fields = np.arange(CAMERA, width)
-        for i in range(self.images):
-            for j in range(self.images):
-                normal[width * i + fields, width * j + fields] += precision[i, j]
+        for i, j in zip(*np.nonzero(precision), strict=True):
+            normal[width * i + fields, width * j + fields] += precision[i, j]
         return normal, right, len(fields) * float(np.linalg.slogdet(precision)[1])
 
-    def _evidence_of_share(self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int]) -> float:
-        normal, right, determinant = self._with_priors(patterns, prior, film_groups)
+    def _evidence_of_share(
+        self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int], images: Sequence[int]
+    ) -> float:
+        normal, right, determinant = self._with_priors(patterns, prior, film_groups, images)
         factor, scale = _factor(normal)
         solution = scale * cho_solve(factor, scale * right)
         log_normal = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
         return 0.5 * (float(right @ solution) + determinant - log_normal)
 
-    def solve(self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int] | None) -> _Solved:
-        normal, right, _ = self._with_priors(patterns, prior, film_groups)
+    def solve(
+        self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int] | None, with_covariance: bool
+    ) -> _Solved:
+        normal, right, _ = self._with_priors(patterns, prior, film_groups, range(self.images))
         factor, scale = _factor(normal)
-        covariance = cho_solve(factor, np.diag(scale)) * scale[:, None]
         found = (scale * cho_solve(factor, scale * right)).reshape(self.images, -1)
         weights = found[:, CAMERA:].reshape(self.images, -1, 2)
-        return _Solved(found[:, :CAMERA], weights, (covariance + covariance.T) / 2.0, -float(right @ found.ravel()))
+        covariance = _inverse(factor[0], scale) if with_covariance else np.empty((0, 0))
+        return _Solved(found[:, :CAMERA], weights, covariance, -float(right @ found.ravel()))
 
     def movement(self, solved: _Solved, cameras: Sequence[PanoramicCamera], patterns: FloatArray) -> float:
         """Rms movement of the observations by a solution, in standard deviations."""
@@ -448,10 +486,15 @@ class _Block:
     def scales_after(
         self, solved: _Solved, rows: Sequence[Rows], weights: Sequence[FloatArray], patterns: FloatArray
     ) -> dict[str, float]:
-        """Variance components: by how much the residuals of each kind exceed their sigmas."""
+        """Variance components: by how much the residuals of each kind exceed their sigmas.
+
+        Where residuals of a cell of film are alike, their mean says less than its points: the scale is the larger one
+        of that of single points and that of cells.
+        """
         width = CAMERA + 2 * patterns.shape[1]
         square = dict.fromkeys(KINDS, BELIEF_IN_SIGMAS)
         redundancy = dict.fromkeys(KINDS, BELIEF_IN_SIGMAS)
+        of_cells: dict[str, list[FloatArray]] = {kind: [] for kind in KINDS}
         for group, equations, weight in zip(self.groups, rows, weights, strict=True):
             columns = np.concatenate([np.arange(width) + width * image for image in group.images])
             taken = float((group.of_patterns(patterns)[0] * solved.covariance[np.ix_(columns, columns)]).sum())
@@ -459,9 +502,55 @@ class _Block:
             residuals = equations.residuals[used]
             square[group.kind] += float((weight[used, None] * residuals**2).sum())
             redundancy[group.kind] += residuals.size - taken / self.scales[group.kind] ** 2
-        return {
-            kind: float(np.clip(np.sqrt(square[kind] / max(redundancy[kind], 1.0)), *SCALE_LIMITS)) for kind in KINDS
-        }
+            of_cells[group.kind].append(_cell_sums(equations, weight))
+        scales = {}
+        for kind in KINDS:
+            variance = square[kind] / max(redundancy[kind], 1.0)
+            cells = np.concatenate([np.empty(0), *of_cells[kind]])
+            if len(cells) >= CELLS_NEEDED:
+                variance = max(variance, float(np.mean(cells**2)))
+            scales[kind] = float(np.clip(np.sqrt(variance), *SCALE_LIMITS))
+        return scales
+
+
+def _cells(rows: Rows, used: BoolArray) -> IntArray:
+    """Number of the cell of the first film that each used row lies in."""
+    cell = np.floor(rows.imaged_mm[used, 0] / CELL_MM)
+    return np.asarray(np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1))
+
+
+def _cell_sums(rows: Rows, weights: FloatArray) -> FloatArray:
+    """Sums of residuals over cells of two or more, divided so that independent residuals keep their variance."""
+    used = weights > 0
+    cell = _cells(rows, used)
+    length = np.sqrt(np.bincount(cell, weights[used] ** 2))
+    several = np.bincount(cell) >= 2
+    sums = [
+        np.bincount(cell, weights[used] * residual)[several] / length[several] for residual in rows.residuals[used].T
+    ]
+    return np.concatenate([np.empty(0), *sums])
+
+
+def unmodelled_mm(rows: Sequence[Rows], weights: Sequence[FloatArray]) -> float:
+    """What residual heights of cells of film have in common, as a displacement on the films, per axis.
+
+    The variance of the means of cells is that of single residuals over their number, and this.
+    """
+    excess = []
+    for group, weight in zip(rows, weights, strict=True):
+        used = weight > 0
+        if group.kind != "dem" or not used.any():
+            continue
+        cell = _cells(group, used)
+        displacement = group.residuals[used, 0] / np.linalg.norm(group.by_film[used, 0].reshape(-1, 4), axis=1)
+        count = np.bincount(cell)
+        mean = np.bincount(cell, displacement) / count
+        inside = (displacement - mean[cell]) ** 2
+        variance = float(inside.sum()) / max(len(cell) - len(count), 1)
+        several = count >= 2
+        excess.append(mean[several] ** 2 - variance / count[several])
+    found = np.concatenate([np.empty(0), *excess])
+    return float(np.sqrt(max(found.mean(), 0.0))) if len(found) >= CELLS_NEEDED else 0.0
 
 
 def _result(
@@ -497,6 +586,7 @@ def _result(
         redundancy=used - taken,
         cost=solved.cost,
         iterations=iterations,
+        unmodelled_mm=unmodelled_mm(rows, weights),
     )
 
 
@@ -530,12 +620,25 @@ def _camera_columns(images: int, normal: FloatArray) -> IntArray:
 
 
 def _factor(normal: FloatArray) -> tuple[tuple[FloatArray, bool], FloatArray]:
-    """Cholesky factor of a normal matrix scaled to unit diagonal, and the scale."""
+    """Cholesky factor of a normal matrix scaled to unit diagonal, and the scale; the matrix is used up."""
     scale: FloatArray = 1.0 / np.sqrt(np.diag(normal))
+    # In place and by columns, as the factorisation wants it: large blocks have matrices of a gigabyte.
+    normal *= scale[:, None]
+    normal *= scale
     try:
-        return cho_factor(normal * scale[:, None] * scale, lower=True), scale
+        return cho_factor(normal.T, lower=True, overwrite_a=True), scale
     except LinAlgError as error:
         raise CospError("the normal equations of cameras and film fields cannot be solved") from error
+
+
+def _inverse(factor: FloatArray, scale: FloatArray) -> FloatArray:
+    """Inverse of a normal matrix from its factor, which is used up."""
+    covariance, _ = dpotri(factor, lower=1, overwrite_c=1)
+    for column in range(len(covariance)):
+        covariance[column, column:] = covariance[column:, column]
+    covariance *= scale[:, None]
+    covariance *= scale
+    return np.asarray(covariance)
 
 
 def _solve(normal: FloatArray, right: FloatArray) -> FloatArray:

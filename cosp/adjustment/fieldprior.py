@@ -9,7 +9,7 @@ from cosp.camera.field import FilmField
 
 # Correlation across the film over that along it: distortion simulated at 60 by 40 mm explains published residuals.
 WIDTH_OVER_LENGTH = 2.0 / 3.0
-SMALLEST_MODE = 1e-5  # of the largest variance; smaller ones are left out
+SMALLEST_MODE = 1e-4  # of the largest variance; smaller ones are left out: together a part in a thousand
 # Distortion found on film is about a pixel and a half of 7 um; within a factor of three either way, two times in three.
 EXPECTED_AMPLITUDE_MM = 0.01
 AMPLITUDE_SPREAD = np.log(3.0)

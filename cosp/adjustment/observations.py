@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosp.arrays import FloatArray
+from cosp.camera.derivatives import film_derivatives
 from cosp.camera.panoramic import PanoramicCamera
 
 
@@ -47,6 +48,9 @@ class Ties:
     first_mm, second_mm : (N, 2) arrays, mm
     sigma_mm : (N,) array, mm
         Standard deviation of each film point, per axis.
+    neighbours : bool
+        The images are neighbouring frames of one camera. Their rays meet at a few degrees: such points tie the frames
+        to each other where the reference gives the height, and have none of their own.
     """
 
     first: int
@@ -54,6 +58,7 @@ class Ties:
     first_mm: FloatArray
     second_mm: FloatArray
     sigma_mm: FloatArray
+    neighbours: bool = False
 
     def __len__(self) -> int:
         return len(self.first_mm)
@@ -145,8 +150,10 @@ FIELD_PRIORS = Priors(
 )
 
 
-# How little the motion of a spacecraft changes from one frame to the next, a few seconds later: change of position over
-# the scan (m), change of angles over the scan (degrees), image motion factor.
+# How little the motion of a spacecraft changes from one frame to the next, a few seconds later: height (m), attitude
+# (degrees), change of position over the scan (m), change of angles over the scan (degrees), image motion factor.
+SUCCESSIVE_HEIGHT_M = 1000.0
+SUCCESSIVE_ATTITUDE_DEG = 0.5
 SUCCESSIVE_VELOCITY_M = 20.0
 SUCCESSIVE_RATE_DEG = 0.03
 SUCCESSIVE_IMC = 0.0005
@@ -155,7 +162,8 @@ SUCCESSIVE_IMC = 0.0005
 def orbit_coupling(scenes: Sequence[str], film_groups: Sequence[int]) -> FloatArray:
     """Information that ties the motions of successive frames of one camera to each other, (13 n, 13 n).
 
-    Position and attitude at mid-scan stay free: when a frame was taken is not known well enough.
+    The horizontal position at mid-scan stays free: when a frame was taken is not known well enough. Height and attitude
+    are held so loosely that only frames without control feel it.
 
     Parameters
     ----------
@@ -166,11 +174,28 @@ def orbit_coupling(scenes: Sequence[str], film_groups: Sequence[int]) -> FloatAr
     """
     count = len(scenes)
     information = np.zeros((13 * count, 13 * count))
-    sigma = np.concatenate([[SUCCESSIVE_VELOCITY_M] * 3, np.radians([SUCCESSIVE_RATE_DEG] * 3), [SUCCESSIVE_IMC]])
-    moving = np.array([3, 4, 5, 9, 10, 11, 12])
+    sigma = np.concatenate(
+        [
+            [SUCCESSIVE_HEIGHT_M],
+            [SUCCESSIVE_VELOCITY_M] * 3,
+            np.radians([SUCCESSIVE_ATTITUDE_DEG] * 3),
+            np.radians([SUCCESSIVE_RATE_DEG] * 3),
+            [SUCCESSIVE_IMC],
+        ]
+    )
+    moving = np.arange(2, 13)
     for group in sorted(set(film_groups)):
         frames = sorted((image for image in range(count) if film_groups[image] == group), key=lambda i: scenes[i])
         for first, second in zip(frames, frames[1:], strict=False):
             for a, b, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
                 information[13 * a + moving, 13 * b + moving] += sign / sigma**2
     return information
+
+
+def place_information(camera: PanoramicCamera, sigma_m: float) -> FloatArray:
+    """Information (13, 13) of knowing where on the ground the middle of a frame lies, per horizontal axis, metres."""
+    middle = np.zeros((1, 2))
+    ground = camera.locate(middle, 0.0)
+    by_camera, by_ground = (of[0] for of in film_derivatives(camera, ground, middle))
+    covariance = sigma_m**2 * by_ground[:, :2] @ by_ground[:, :2].T
+    return np.asarray(by_camera.T @ np.linalg.solve(covariance, by_camera))

@@ -13,6 +13,7 @@ from cosp.adjustment.calibration import Calibration, computed_variances
 from cosp.adjustment.observations import Ties
 from cosp.adjustment.rows import Rows, ground_by_film, intersections
 from cosp.arrays import FloatArray
+from cosp.camera.derivatives import film_derivatives
 from cosp.camera.panoramic import PanoramicCamera
 
 
@@ -59,6 +60,7 @@ def height_sigma(
     covariance: FloatArray,
     calibration: Calibration | None,
     film_sigma_mm: float,
+    reference_sigma_m: float = 0.0,
     height_m: float,
     step_mm: float,
 ) -> HeightSigma:
@@ -76,6 +78,8 @@ def height_sigma(
         Its covariance of cameras and film fields is used instead.
     film_sigma_mm : float
         Distortion of film that the adjustment did not describe, per axis and film.
+    reference_sigma_m : float
+        Smooth error of the reference heights, which the adjustment copies.
     height_m : float
         Ellipsoidal height of the ground.
     step_mm : float
@@ -102,15 +106,50 @@ def height_sigma(
         film_by_camera=at.film_by_camera,
         imaged_mm=at.imaged_mm,
     )
-    if calibration is not None and camera.film_field is not None:
-        variance = computed_variances(rows, calibration.covariance, calibration.patterns, camera.film_field)[:, 0]
-    else:
-        jacobian = rows.by_camera().reshape(-1, 2 * PARAMETERS)
-        columns = np.concatenate([np.arange(PARAMETERS) + PARAMETERS * image for image in rows.images])
-        variance = np.einsum("na,ab,nb->n", jacobian, covariance[np.ix_(columns, columns)], jacobian)
+    variance = _variances(rows, camera, covariance, calibration)[:, 0]
     sigma = np.full(len(film), np.nan)
-    sigma[inside] = np.sqrt(variance + film_sigma_mm**2 * (by_film**2).sum(axis=1))
+    sigma[inside] = np.sqrt(variance + film_sigma_mm**2 * (by_film**2).sum(axis=1) + reference_sigma_m**2)
     return HeightSigma(camera.scene, x, y, _continued(sigma.reshape(len(y), len(x))), height_m)
+
+
+def place_sigma_m(
+    camera: PanoramicCamera, image: int, *, covariance: FloatArray, calibration: Calibration | None, height_m: float
+) -> tuple[float, float]:
+    """Standard deviations east and north of where film points lie at a known height, root mean square over the film.
+
+    Parameters
+    ----------
+    camera : PanoramicCamera
+        Adjusted.
+    image : int
+        Its place in the block.
+    covariance, calibration, height_m
+        As for `height_sigma`.
+    """
+    x, y = (np.linspace(-half, half, count) for half, count in ((camera.half_length_mm, 21), (camera.half_width_mm, 5)))
+    film = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    by_camera, by_ground = film_derivatives(camera, camera.locate(film, height_m), film)
+    rows = Rows(
+        kind="gcp",
+        images=(image,),
+        residuals=np.zeros((len(film), 2)),
+        by_film=-np.linalg.inv(by_ground[:, :, :2])[:, :, None, :],
+        film_by_camera=by_camera[:, None],
+        imaged_mm=camera.imaged(film)[:, None],
+    )
+    east, north = np.sqrt(_variances(rows, camera, covariance, calibration).mean(axis=0))
+    return float(east), float(north)
+
+
+def _variances(
+    rows: Rows, camera: PanoramicCamera, covariance: FloatArray, calibration: Calibration | None
+) -> FloatArray:
+    """Variances (M, K) of what rows compute, from the calibration if there is one."""
+    if calibration is not None and camera.film_field is not None:
+        return computed_variances(rows, calibration.covariance, calibration.patterns, camera.film_field)
+    jacobian = rows.by_camera().reshape(*rows.residuals.shape, PARAMETERS * len(rows.images))
+    columns = np.concatenate([np.arange(PARAMETERS) + PARAMETERS * image for image in rows.images])
+    return np.asarray(np.einsum("nka,ab,nkb->nk", jacobian, covariance[np.ix_(columns, columns)], jacobian))
 
 
 def _continued(values: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cosp.adjustment.bundle import Adjustment, adjust
+from cosp.adjustment.bundle import adjust
 from cosp.adjustment.observations import Control, Priors
 from cosp.adjustment.solver import START_SIGMA
 from cosp.arrays import FloatArray
@@ -60,6 +60,7 @@ def resect(
     sigma_height_m: ArrayLike = 0.0,
     directions: Sequence[int] = DIRECTIONS,
     start_sigma: float = START_SIGMA,
+    information: FloatArray | None = None,
 ) -> Resection:
     """The 13 parameters of one image from control points, half or more of which may be wrong.
 
@@ -84,6 +85,8 @@ def resect(
         the other way); it is the priors on velocity, rates and image motion that tell them apart.
     start_sigma : float
         First width of the robust weights.
+    information : (13, 13) array
+        What else is believed of the camera.
 
     Raises
     ------
@@ -99,7 +102,18 @@ def resect(
         sigma_ground_m=np.broadcast_to(np.asarray(sigma_ground_m, float), count),
         sigma_height_m=np.broadcast_to(np.asarray(sigma_height_m, float), count),
     )
-    tried = [_adjusted(camera, direction, control, priors, gate_sigma, start_sigma) for direction in directions]
+    tried = [
+        adjust(
+            [camera.with_parameters(camera.parameters(), scan_direction=direction)],
+            [control],
+            [],
+            priors=priors,
+            gate_sigma=gate_sigma,
+            start_sigma=start_sigma,
+            information=information,
+        )
+        for direction in directions
+    ]
     tried.sort(key=lambda adjustment: adjustment.cost)
     best = tried[0]
     found = best.cameras[0]
@@ -112,15 +126,3 @@ def resect(
         other_direction_cost=tried[1].cost - best.cost if len(tried) > 1 else float("nan"),
         covariance=best.covariance,
     )
-
-
-def _adjusted(
-    camera: PanoramicCamera,
-    direction: int,
-    control: Control,
-    priors: Priors,
-    gate_sigma: float,
-    start_sigma: float,
-) -> Adjustment:
-    start = camera.with_parameters(camera.parameters(), scan_direction=direction)
-    return adjust([start], [control], [], priors=priors, gate_sigma=gate_sigma, start_sigma=start_sigma)

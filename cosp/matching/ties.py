@@ -1,8 +1,9 @@
-"""Tie points: the same ground in a fore and an aft film, matched on the map and brought back to both films."""
+"""Tie points: the same ground in two films, fore and aft or neighbours, matched on the map and brought back to both."""
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -40,10 +41,19 @@ _TERRAIN_POSTING_M = 200.0
 # Terms of the smooth offset between the films: x^i y^j up to these degrees.
 _DEGREE_X, _DEGREE_Y = 4, 1
 _MIN_FOR_OFFSET = 40
+# Templates take up to this share of the breadth of what both films show; smaller ones than this are not unique.
+_TEMPLATE_SHARE = 0.6
+_LEAST_TEMPLATE_PX = 15
+# A level may search so many times farther than usual before a coarser one is worth its while.
+_WIDE_SEARCH = 3
+_WIDEST_SEARCH_PX = 100
+# Cells in which the shared piece of two films is found.
+_FINE_CELLS = (150, 60)
 # Candidates along either side of a map tile.
 _TILE_SIDE = 4
 # Cells of the film, along and across, by which coverage is told.
 _CELLS = (30, 4)
+_PER_CELL, _SHARE_OF_CELL = 5, 0.2
 # However high the score: terrain that the DEM does not hold shows differently in two films taken 30 degrees apart.
 _LEAST_SIGMA_PX = 0.3
 
@@ -54,17 +64,22 @@ class FilmMatches:
 
     Parameters
     ----------
-    fore_mm, aft_mm, predicted_aft_mm : (N, 2) arrays
-        Film points, and where the aft film would show the fore point by both cameras.
+    first_mm, second_mm, predicted_mm : (N, 2) arrays
+        Film points, and where the second film would show the first point by both cameras.
     score, sigma_px : (N,) arrays
         Standard deviation per coordinate in pixels of the matched images.
     """
 
-    fore_mm: FloatArray
-    aft_mm: FloatArray
-    predicted_aft_mm: FloatArray
+    first_mm: FloatArray
+    second_mm: FloatArray
+    predicted_mm: FloatArray
     score: FloatArray
     sigma_px: FloatArray
+
+    @classmethod
+    def none(cls) -> FilmMatches:
+        """Without any match."""
+        return cls(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0))
 
     def __len__(self) -> int:
         return len(self.score)
@@ -72,19 +87,19 @@ class FilmMatches:
     def subset(self, keep: BoolArray) -> FilmMatches:
         """Those matches that are chosen by a mask."""
         return FilmMatches(
-            self.fore_mm[keep], self.aft_mm[keep], self.predicted_aft_mm[keep], self.score[keep], self.sigma_px[keep]
+            self.first_mm[keep], self.second_mm[keep], self.predicted_mm[keep], self.score[keep], self.sigma_px[keep]
         )
 
 
 def match_films(
-    fore: FilmImage,
-    aft: FilmImage,
-    fore_camera: PanoramicCamera,
-    aft_camera: PanoramicCamera,
+    first: FilmImage,
+    second: FilmImage,
+    first_camera: PanoramicCamera,
+    second_camera: PanoramicCamera,
     *,
     heights_on: OnGrid,
     crs: str,
-    matcher: Matcher,
+    matcher_of: Callable[[int, int], Matcher],
     candidates: int,
     template_px: int,
     search_px: int,
@@ -95,19 +110,26 @@ def match_films(
     trials: int,
     rng: np.random.Generator,
     threads: int,
+    offset_m: float = 0.0,
 ) -> FilmMatches:
-    """Tie points of a pair, spread over the overlap, gross errors removed tile by tile.
+    """Tie points of two films, spread over what both show, gross errors removed tile by tile.
 
     Parameters
     ----------
-    fore, aft : FilmImage
+    first, second : FilmImage
         At full resolution; only the tiles that are matched are read.
     heights_on : function of a PixelGrid
         Ellipsoidal heights, NaN outside.
+    matcher_of : function
+        Matcher with a template and a search range in pixels.
     candidates : int
         Points that are tried.
+    template_px, search_px : int
+        Templates are smaller where both films show a narrow strip only.
     gate_px, tile_mm, min_per_tile, trials
         See `consistent_by_tile`; the gate in film pixels.
+    offset_m : float
+        How far the frames may be misplaced against each other; the search begins wide enough for that.
 
     Raises
     ------
@@ -116,72 +138,164 @@ def match_films(
     NotEnoughMatchesError
         If fewer than `min_ties` remain.
     """
-    shared = _shared_bounds(map_bounds(fore_camera, crs), map_bounds(aft_camera, crs))
+    scenes = f"{first_camera.scene} and {second_camera.scene}"
+    bounds = _shared_bounds(map_bounds(first_camera, crs), map_bounds(second_camera, crs))
+    if bounds is None:
+        raise NoOverlapError(f"{scenes} show no common ground")
+    pixel_m = max(ground_pixel_m(c, f.pixel_mm, 0.0) for c, f in ((first_camera, first), (second_camera, second)))
+    terrain = Terrain.on(heights_on, grown(bounds, 5000.0 + offset_m), crs, _TERRAIN_POSTING_M)
+    shared = _Shared.of(first_camera, second_camera, terrain.mean_m)
     if shared is None:
-        raise NoOverlapError(f"{fore_camera.scene} and {aft_camera.scene} show no common ground")
-    pixel_m = max(ground_pixel_m(c, f.pixel_mm, 0.0) for c, f in ((fore_camera, fore), (aft_camera, aft)))
-    terrain = Terrain.on(heights_on, grown(shared, 5000.0), crs, _TERRAIN_POSTING_M)
-    step_px = max(template_px // 2, 12)
-    margin_px = template_px // 2 + search_px
-    tile_px = template_px + 2 * search_px + (_TILE_SIDE - 1) * step_px + 4
+        raise NoOverlapError(f"{scenes} show no common ground")
+    passes = _passes(shared.breadth_mm / first.pixel_mm, offset_m / pixel_m, template_px, search_px)
+    reach_px = max(_tile_px(size, search) * factor for factor, size, search in passes)
+    projectors = [
+        MapProjector(camera, crs, grown(terrain.grid.bounds, 0.6 * reach_px * pixel_m))
+        for camera in (first_camera, second_camera)
+    ]
 
-    area = grown(terrain.grid.bounds, 0.6 * tile_px * _COARSE * pixel_m)
-    projectors = [MapProjector(camera, crs, area) for camera in (fore_camera, aft_camera)]
-
-    share = float(_seen_by(aft_camera, fore_camera, _tile_points(fore_camera, 1000), terrain.mean_m).mean())
-
-    def pass_at(posting_m: float, offset: Callable[[FloatArray], FloatArray], count: int) -> FilmMatches:
+    def pass_at(
+        factor: int, size_px: int, range_px: int, offset: Callable[[FloatArray], FloatArray], count: int
+    ) -> FilmMatches:
+        posting_m = factor * pixel_m
+        matcher = matcher_of(size_px, range_px)
+        step_px = _step_px(size_px)
         # Templates that overlap by more than half say little more.
-        most = share * _area_mm2(fore_camera) / (step_px * posting_m / pixel_m * fore.pixel_mm) ** 2
-        tiles = max(1, int(min(count, most)) // _TILE_SIDE**2)
-        points_mm = _tile_points(fore_camera, max(1, round(tiles / max(share, 1e-3))))
-        points_mm = points_mm[_seen_by(aft_camera, fore_camera, points_mm, terrain.mean_m)]
+        most = shared.area_mm2 / (step_px * factor * first.pixel_mm) ** 2
+        points_mm = shared.points(first_camera, second_camera, max(1, int(min(count, most)) // _TILE_SIDE**2))
         factors = [reduction_for(posting_m, ground_pixel_m(c, f.pixel_mm, terrain.mean_m)) for c, f in
-                   ((fore_camera, fore), (aft_camera, aft))]  # fmt: skip
-        films = [film.reduced(n) if n > 1 else film.buffered() for film, n in zip((fore, aft), factors, strict=True)]
-        places = terrain.map_points(fore_camera, points_mm)
+                   ((first_camera, first), (second_camera, second))]  # fmt: skip
+        films = [
+            film.reduced(n) if n > 1 else film.buffered() for film, n in zip((first, second), factors, strict=True)
+        ]
+        places = terrain.map_points(first_camera, points_mm)
         places = places[np.isfinite(places).all(axis=1)]
-        inside = (places[:, 0] > shared[0]) & (places[:, 0] < shared[2]) & (places[:, 1] > shared[1])
-        places = places[inside & (places[:, 1] < shared[3])]
+        inside = (places[:, 0] > bounds[0]) & (places[:, 0] < bounds[2]) & (places[:, 1] > bounds[1])
+        places = places[inside & (places[:, 1] < bounds[3])]
 
         def work(place: FloatArray) -> list[FloatArray]:
-            grid = tile_about(place[0], place[1], posting_m, tile_px)
+            grid = tile_about(place[0], place[1], posting_m, _tile_px(size_px, range_px))
             heights = heights_on(grid)
-            fore_mm, aft_mm = (film_coordinates(projector, grid, heights) for projector in projectors)
+            first_mm, second_mm = (film_coordinates(projector, grid, heights) for projector in projectors)
             # The offset changes so slowly that one value does for a tile.
             middle = projectors[1].film(place[None, 0], place[None, 1], place[None, 2])
             moved = offset(middle)
-            seen = films[0].sample(fore_mm), films[1].sample(aft_mm + moved)
+            seen = films[0].sample(first_mm), films[1].sample(second_mm + moved)
             if not (np.isfinite(seen[0]).any() and np.isfinite(seen[1]).any()):
                 return []
-            found = matcher.match(*seen, lattice_rc(grid.shape, step_px, margin_px), threads=1)
+            found = matcher.match(*seen, lattice_rc(grid.shape, step_px, size_px // 2 + range_px), threads=1)
             if not len(found):
                 return []
-            fore_points = film_points_at(projectors[0], grid, heights, found.moving_rc)
-            aft_points = film_points_at(projectors[1], grid, heights, found.fixed_rc)
+            first_points = film_points_at(projectors[0], grid, heights, found.moving_rc)
+            second_points = film_points_at(projectors[1], grid, heights, found.fixed_rc)
             predicted = film_points_at(projectors[1], grid, heights, found.moving_rc)
             sigma_px = np.maximum(found.sigma_px, _LEAST_SIGMA_PX)
-            rows = np.column_stack([fore_points, aft_points + moved, predicted, found.score, sigma_px])
+            rows = np.column_stack([first_points, second_points + moved, predicted, found.score, sigma_px])
             return [rows[np.isfinite(rows).all(axis=1)]]
 
         table = np.concatenate([np.empty((0, 8)), *sum(in_threads(work, list(places), threads), [])])
         matches = FilmMatches(table[:, 0:2], table[:, 2:4], table[:, 4:6], table[:, 6], table[:, 7])
-        gate_mm = gate_px * posting_m / pixel_m * max(fore.pixel_mm, aft.pixel_mm)
+        gate_mm = gate_px * factor * max(first.pixel_mm, second.pixel_mm)
         keep = consistent_by_tile(
-            matches.predicted_aft_mm, matches.aft_mm,
+            matches.predicted_mm, matches.second_mm,
             tile_mm=tile_mm, gate_mm=gate_mm, minimum=min_per_tile, trials=trials, rng=rng,
         )  # fmt: skip
         log.info("%d of %d matches agree with their neighbours at %.1f m", keep.sum(), len(matches), posting_m)
         return matches.subset(keep)
 
-    coarse = pass_at(_COARSE * pixel_m, lambda film_mm: np.zeros_like(film_mm), candidates // _COARSE)
-    ties = pass_at(pixel_m, _smooth_offset(coarse, aft_camera), candidates)
-    require(len(ties), min_ties, f"{fore_camera.scene} and {aft_camera.scene}", "tie points")
+    ties = FilmMatches.none()
+    for factor, size_px, range_px in passes:
+        ties = pass_at(factor, size_px, range_px, _smooth_offset(ties, second_camera), candidates // factor)
+    require(len(ties), min_ties, scenes, "tie points")
     return ties
 
 
-def _area_mm2(camera: PanoramicCamera) -> float:
-    return 4 * camera.half_length_mm * camera.half_width_mm
+def _passes(breadth_px: float, offset_px: float, template_px: int, search_px: int) -> list[tuple[int, int, int]]:
+    """From coarse to fine: reduction, template and search range in reduced pixels.
+
+    Where the films share a narrow strip, templates shrink, down to `_LEAST_TEMPLATE_PX`, and a level whose templates
+    would not fit is left out. The coarsest level searches as far as the frames may be misplaced.
+    """
+
+    def fitting(factor: int) -> int:
+        return int(min(template_px, _TEMPLATE_SHARE * breadth_px / factor))
+
+    factors = [1]
+    while fitting(_COARSE * factors[0]) >= _LEAST_TEMPLATE_PX and (
+        factors[0] == 1 or offset_px > _WIDE_SEARCH * search_px * factors[0]
+    ):
+        factors.insert(0, _COARSE * factors[0])
+    first_range = min(max(search_px, math.ceil(offset_px / factors[0])), _WIDEST_SEARCH_PX)
+    return [
+        (factor, max(fitting(factor), _LEAST_TEMPLATE_PX), first_range if n == 0 else search_px)
+        for n, factor in enumerate(factors)
+    ]
+
+
+def _step_px(template_px: int) -> int:
+    """Distance of candidates."""
+    return max(template_px // 2, 12)
+
+
+def _tile_px(template_px: int, search_px: int) -> int:
+    """Side of a map tile that holds its candidates and all they may look at."""
+    return template_px + 2 * search_px + (_TILE_SIDE - 1) * _step_px(template_px) + 4
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """The piece of the first film that shows ground which the second shows too.
+
+    Parameters
+    ----------
+    middle_mm, half_mm : two floats
+        The rectangle about it.
+    share : float
+        Of the rectangle.
+    breadth_mm : float
+        Median extent across the film.
+    height_m : float
+        Of the ground.
+    """
+
+    middle_mm: tuple[float, float]
+    half_mm: tuple[float, float]
+    share: float
+    breadth_mm: float
+    height_m: float
+
+    @classmethod
+    def of(cls, camera: PanoramicCamera, other: PanoramicCamera, height_m: float) -> _Shared | None:
+        """None where nothing is shared."""
+        columns, rows = _FINE_CELLS
+        lattice = film_lattice(camera.half_length_mm, camera.half_width_mm, columns, rows)
+        seen = _seen_by(other, camera, lattice, height_m)
+        if not seen.any():
+            return None
+        cell = np.array([2 * camera.half_length_mm / columns, 2 * camera.half_width_mm / rows])
+        low, high = lattice[seen].min(axis=0) - cell / 2, lattice[seen].max(axis=0) + cell / 2
+        inside = ((lattice > low) & (lattice < high)).all(axis=1)
+        across = seen.reshape(columns, rows).sum(axis=1) * cell[1]
+        (x, y), (half_x, half_y) = (low + high) / 2, (high - low) / 2
+        return cls(
+            (float(x), float(y)),
+            (float(half_x), float(half_y)),
+            float(seen.sum() / inside.sum()),
+            float(np.median(across[across > 0])),
+            height_m,
+        )
+
+    @property
+    def area_mm2(self) -> float:
+        """Of the piece itself."""
+        return 4 * self.half_mm[0] * self.half_mm[1] * self.share
+
+    def points(self, camera: PanoramicCamera, other: PanoramicCamera, count: int) -> FloatArray:
+        """About `count` film points of the piece, evenly spread."""
+        whole = count / self.share
+        rows = max(1, round((whole * self.half_mm[1] / self.half_mm[0]) ** 0.5))
+        points = film_lattice(*self.half_mm, max(1, round(whole / rows)), rows) + np.array(self.middle_mm)
+        return np.asarray(points[_seen_by(other, camera, points, self.height_m)])
 
 
 def _seen_by(other: PanoramicCamera, camera: PanoramicCamera, film_mm: FloatArray, height_m: float) -> BoolArray:
@@ -192,18 +306,19 @@ def _seen_by(other: PanoramicCamera, camera: PanoramicCamera, film_mm: FloatArra
 
 
 def summary(
-    ties: FilmMatches, fore_camera: PanoramicCamera, aft_camera: PanoramicCamera, *, height_m: float
+    ties: FilmMatches, first_camera: PanoramicCamera, second_camera: PanoramicCamera, *, height_m: float
 ) -> dict[str, Any]:
     """Count, precision and spread of tie points.
 
-    Coverage is the share of equal cells of the fore film that hold a tie point, of those whose middle both films show
-    on ground of about the height given.
+    Coverage is the share of equal cells of the first film that hold a tie point, of those of which both films show a
+    fifth or more on ground of about the height given.
     """
     columns, rows = _CELLS
-    half = np.array([fore_camera.half_length_mm, fore_camera.half_width_mm])
-    middles = film_lattice(half[0], half[1], columns, rows)
-    shared = _seen_by(aft_camera, fore_camera, middles, height_m).reshape(columns, rows)
-    index = np.clip(((ties.fore_mm / half + 1) / 2 * _CELLS).astype(int), 0, np.array(_CELLS) - 1)
+    half = np.array([first_camera.half_length_mm, first_camera.half_width_mm])
+    fine = film_lattice(half[0], half[1], columns * _PER_CELL, rows * _PER_CELL)
+    seen = _seen_by(second_camera, first_camera, fine, height_m).reshape(columns, _PER_CELL, rows, _PER_CELL)
+    shared = seen.mean(axis=(1, 3)) >= _SHARE_OF_CELL
+    index = np.clip(((ties.first_mm / half + 1) / 2 * _CELLS).astype(int), 0, np.array(_CELLS) - 1)
     counts = np.zeros(_CELLS, int)
     np.add.at(counts, (index[:, 0], index[:, 1]), 1)
     filled = (counts > 0) & shared
@@ -219,14 +334,8 @@ def summary(
     }
 
 
-def _tile_points(camera: PanoramicCamera, count: int) -> FloatArray:
-    """About `count` film points, evenly spread."""
-    rows = max(1, round((count * camera.half_width_mm / camera.half_length_mm) ** 0.5))
-    return film_lattice(camera.half_length_mm, camera.half_width_mm, max(1, round(count / rows)), rows)
-
-
 def _smooth_offset(matches: FilmMatches, camera: PanoramicCamera) -> Callable[[FloatArray], FloatArray]:
-    """Aft film point minus its prediction, as a smooth function of the aft film point."""
+    """Second film point minus its prediction, as a smooth function of the second film point."""
     scale = np.array([camera.half_length_mm, camera.half_width_mm])
 
     def terms(film_mm: FloatArray) -> FloatArray:
@@ -235,8 +344,8 @@ def _smooth_offset(matches: FilmMatches, camera: PanoramicCamera) -> Callable[[F
 
     if len(matches) < _MIN_FOR_OFFSET:
         return lambda film_mm: np.zeros_like(film_mm)
-    change = matches.aft_mm - matches.predicted_aft_mm
-    solution = np.linalg.lstsq(terms(matches.predicted_aft_mm), change, rcond=None)[0]
+    change = matches.second_mm - matches.predicted_mm
+    solution = np.linalg.lstsq(terms(matches.predicted_mm), change, rcond=None)[0]
     return lambda film_mm: np.asarray(terms(film_mm) @ solution)
 
 

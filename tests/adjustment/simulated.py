@@ -1,11 +1,12 @@
 """A pair with known truth: the paper's cameras, hilly ground, smooth film distortion, noise, gross errors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cosp.adjustment.observations import Control, Ties
 from cosp.camera.panoramic import PanoramicCamera
+from cosp.geometry.frames import LocalFrame
 from cosp.geometry.rays import meet
 from tests.authorities.parameter_table import PIXEL_MM, pair
 
@@ -27,6 +28,20 @@ class FilmDistortion:
     def __call__(self, film_mm):
         waves = [np.cos(film_mm @ k.T + phase).sum(-1) for k, phase in zip(self.frequency, self.phase, strict=True)]
         return self.amplitude_mm * np.stack(waves, axis=-1)
+
+
+class SteppedFilm:
+    """Film whose scanner set it down anew every 20 mm, each time some pixels off, besides its smooth distortion."""
+
+    every_mm = 20.0
+
+    def __init__(self, rng, smooth, step_px):
+        self.smooth = smooth
+        self.offset_mm = rng.normal(0.0, step_px * PIXEL_MM / np.sqrt(2.0), (64, 2))
+
+    def __call__(self, film_mm):
+        block = np.clip((film_mm[..., 0] / self.every_mm + 32).astype(int), 0, 63)
+        return self.smooth(film_mm) + self.offset_mm[block]
 
 
 def terrain_m(ground):
@@ -98,6 +113,7 @@ def simulate_pair(
     film_sigma_px=0.0,
     pixel_mm=PIXEL_MM,
     cameras=None,
+    step_px=0.0,
 ):
     """Observations of a pair; every other block of 60 x 27 mm of film is held out as check points.
 
@@ -106,6 +122,8 @@ def simulate_pair(
     """
     cameras = pair(name) if cameras is None else cameras
     distortions = (FilmDistortion(rng, distortion_px), FilmDistortion(rng, distortion_px))
+    if step_px:
+        distortions = tuple(SteppedFilm(rng, smooth, step_px) for smooth in distortions)
     control, checks, gross = [], [], []
     for camera, distortion in zip(cameras, distortions, strict=True):
         film = film_sample(rng, gcps)
@@ -133,3 +151,83 @@ def simulate_pair(
     )
     sigma_mm = np.full(len(first), np.hypot(TIE_PX, film_sigma_px) * pixel_mm)
     return SimulatedPair(cameras, distortions, control, checks, gross, Ties(0, 1, first_mm, second_mm, sigma_mm))
+
+
+OVERLAP = 0.08  # of successive frames of one camera, share of their width
+# How unlike successive frames are: velocity, attitude, its rates.
+UNLIKE = np.concatenate([np.zeros(3), [5.0] * 3, np.radians([0.1] * 3 + [0.01] * 3), [1e-4]])
+
+
+@dataclass(frozen=True)
+class SimulatedBlock:
+    """Successive pairs of one pass: fore and aft of the first pair, of the second, and so on."""
+
+    cameras: list[PanoramicCamera]
+    distortions: list[FilmDistortion]
+    control: list[Control]
+    ties: list[Ties]
+
+    @property
+    def film_groups(self):
+        return [image % 2 for image in range(len(self.cameras))]
+
+    def start(self, rng, off_m=1000.0):
+        """Start cameras, each off in its place on the ground."""
+        found = []
+        for camera in self.cameras:
+            off = np.concatenate([rng.normal(0.0, off_m, 2), np.zeros(11)])
+            found.append(camera.with_parameters(camera.parameters() + off))
+        return found
+
+    def without_control(self, images):
+        """The same, of which some images have no control."""
+        nothing = Control(np.empty((0, 2)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0))
+        return replace(self, control=[nothing if i in images else points for i, points in enumerate(self.control)])
+
+    def errors_m(self, adjusted, pair, count=2000):
+        """East, north, up (N, 3) of noise-free points of a pair intersected with adjusted cameras, and first points."""
+        fore, aft = 2 * pair, 2 * pair + 1
+        first, second, ground = conjugates((self.cameras[fore], self.cameras[aft]), np.random.default_rng(99), count)
+        measured = [film + self.distortions[i](film) for i, film in ((fore, first), (aft, second))]
+        found, _ = meet(*(adjusted[i].rays(film) for i, film in zip((fore, aft), measured, strict=True)))
+        return found - ground, measured[0]
+
+
+def simulate_block(rng, *, pairs=3, gcps=300, ties=1500, neighbour_ties=200, distortion_px=1.5):
+    """Observations of successive pairs, whose neighbouring frames overlap by a few per cent."""
+    first = pair("1112")
+    edges = first[0].locate(np.array([[0.0, -27.7], [0.0, 27.7]]), 1500.0)
+    step = (1.0 - OVERLAP) * (edges[0] - edges[1])
+    cameras, origin = [], first[0].origin
+    for n in range(pairs):
+        longitude, latitude, _ = origin.geodetic_from_local(n * step)
+        for camera, name in zip(first, "FA", strict=True):
+            moved = replace(
+                camera, origin=LocalFrame(float(longitude), float(latitude)), scene=f"DS1112-D{name}{n:03d}"
+            )
+            moved = moved.moved_to(origin)
+            cameras.append(moved.with_parameters(moved.parameters() + UNLIKE * rng.normal(size=13)))
+    distortions = [FilmDistortion(rng, distortion_px) for _ in cameras]
+
+    def measured(image, film):
+        return film + distortions[image](film)
+
+    def tied(one, other, count, neighbours):
+        films = conjugates((cameras[one], cameras[other]), rng, 10 * count if neighbours else count)[:2]
+        noisy = [
+            measured(image, film[:count]) + rng.normal(0.0, TIE_PX * PIXEL_MM, film[:count].shape)
+            for image, film in zip((one, other), films, strict=True)
+        ]
+        return Ties(one, other, *noisy, np.full(len(noisy[0]), TIE_PX * PIXEL_MM), neighbours)
+
+    control = []
+    for image, camera in enumerate(cameras):
+        film = film_sample(rng, gcps)
+        ground = on_terrain(camera, film)
+        given = ground + rng.normal(0.0, [GROUND_M, GROUND_M, HEIGHT_M], ground.shape)
+        noisy = measured(image, film) + rng.normal(0.0, MATCH_PX * PIXEL_MM, film.shape)
+        sigmas = (np.full(gcps, sigma) for sigma in (MATCH_PX * PIXEL_MM, GROUND_M, HEIGHT_M))
+        control.append(Control(noisy, given, *sigmas))
+    sets = [tied(2 * n, 2 * n + 1, ties, False) for n in range(pairs)]
+    sets += [tied(2 * n + side, 2 * n + 2 + side, neighbour_ties, True) for n in range(pairs - 1) for side in (0, 1)]
+    return SimulatedBlock(cameras, distortions, control, sets)

@@ -128,11 +128,11 @@ def test_tie_points_are_the_same_ground_in_both_films(world):
     films = [world.expose(c, rng=np.random.default_rng(i)) for i, c in enumerate(cameras)]
     ties = match_films(
         *films, *cameras,
-        heights_on=world.on(world.heights), crs=CRS, matcher=structural(41, 8, 0.3, 0.9, 1.0),
+        heights_on=world.on(world.heights), crs=CRS, matcher_of=lambda *sizes: structural(*sizes, 0.3, 0.9, 1.0),
         candidates=800, template_px=41, search_px=8, gate_px=2.0, tile_mm=60.0, min_per_tile=6, min_ties=50,
         trials=100, rng=np.random.default_rng(0), threads=1,
     )  # fmt: skip
-    _, gap_m = meet(cameras[0].rays(ties.fore_mm), cameras[1].rays(ties.aft_mm))
+    _, gap_m = meet(cameras[0].rays(ties.first_mm), cameras[1].rays(ties.second_mm))
     pixel_m = ground_pixel_m(cameras[0], films[0].pixel_mm, 1000.0)
     assert len(ties) > 200
     assert ties.sigma_px.min() >= 0.3

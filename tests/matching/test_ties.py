@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cosp.matching.ground import film_lattice
-from cosp.matching.ties import FilmMatches, summary
+from cosp.matching.ties import FilmMatches, _passes, _Shared, summary
 
 from .conftest import make_camera, moved
 
@@ -33,3 +33,30 @@ def test_only_ground_that_both_films_show_counts():
     assert cells["coverage"] == 0.0
     assert 30 <= cells["cells_shared"] <= 90
     assert cells["sigma_px"] is None
+
+
+@pytest.mark.parametrize(
+    ("breadth_px", "offset_px", "expected"),
+    [
+        (7900.0, 0.0, [(4, 49, 10), (1, 49, 10)]),  # a pair, well placed
+        (550.0, 0.0, [(4, 49, 10), (1, 49, 10)]),  # neighbours at 7 um
+        (28.0, 0.0, [(1, 16, 10)]),  # neighbours at 140 um: no room for a coarser level
+        (7900.0, 1700.0, [(64, 49, 27), (16, 49, 10), (4, 49, 10), (1, 49, 10)]),  # a pair placed by its neighbours
+        (550.0, 1700.0, [(16, 20, 100), (4, 49, 10), (1, 49, 10)]),
+    ],
+)
+def test_levels_fit_into_what_is_shared_and_reach_as_far_as_frames_may_be_misplaced(breadth_px, offset_px, expected):
+    assert _passes(breadth_px, offset_px, 49, 10) == expected
+
+
+def test_the_shared_piece_of_neighbours_is_a_strip_and_its_points_fill_it():
+    first = make_camera()
+    second = moved(make_camera(), 0.0, 13500.0)  # most of a width along the flight
+    shared = _Shared.of(first, second, 500.0)
+    assert shared is not None
+    assert shared.breadth_mm < 0.35 * 2 * first.half_width_mm
+    points = shared.points(first, second, 200)
+    assert 100 <= len(points) <= 300
+    assert np.ptp(points[:, 0]) > 1.8 * first.half_length_mm
+    assert np.ptp(points[:, 1]) > 0.4 * shared.breadth_mm
+    assert _Shared.of(first, moved(make_camera(), 0.0, 60000.0), 500.0) is None
