@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from cosp.arrays import ByteArray
 from cosp.dense import kernels
+from cosp.dense.memory import Workspace
 
 _log = logging.getLogger(__name__)
 
 LARGEST_PENALTY = 127 - kernels.CENSUS_BITS
 """Two path costs must add up within a byte."""
-
-_spare: list[ByteArray] = []
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,7 @@ def aggregate_costs(
     disparities: int,
     small_step: int,
     large_step: int,
+    memory: Workspace | None = None,
 ) -> Winners:
     """Cheapest of the disparities -disparities / 2 … disparities / 2 - 1 at each pixel, after semi-global aggregation.
 
@@ -57,6 +57,9 @@ def aggregate_costs(
     small_step, large_step : int
         Penalty for a change of disparity by one and by more from pixel to pixel, in bits of the census.
 
+    memory : Workspace
+        Where the result lies, which then lasts until it is used for the next.
+
     References
     ----------
     [Hirschmuller2008] section 2.2.
@@ -67,42 +70,25 @@ def aggregate_costs(
     margin = (right_planes.shape[2] - columns) // 2
     if margin < disparities // 2:
         raise ValueError(f"right picture goes on by {margin} columns, {disparities // 2} are needed")
+    memory = memory or Workspace()
     found = Winners(
-        np.empty((rows, columns), np.uint8),
-        np.empty((rows, columns, 4), np.uint16),
-        np.empty((rows, columns + disparities), np.uint8),
+        memory.array("winners", (rows, columns), np.uint8),
+        memory.array("costs", (rows, columns, 4), np.uint16),
+        memory.array("right winners", (rows, columns + disparities), np.uint8),
     )
-    pixels = rows * columns
-    size = pixels * (2 * disparities + 4)
-    memory = _memory_of(size)
-    try:
-        _passes(disparities)(
-            left_planes,
-            right_planes,
-            margin - disparities // 2,
-            small_step,
-            large_step,
-            memory[4 * pixels : size].reshape(2, rows, columns, disparities),
-            memory[: 4 * pixels].view(np.uint32).reshape(rows, columns),
-            found.winners,
-            found.costs,
-            found.right_winners,
-        )
-    finally:
-        _spare.append(memory)
+    _passes(disparities)(
+        left_planes,
+        right_planes,
+        margin - disparities // 2,
+        small_step,
+        large_step,
+        memory.array("volume", (2, rows, columns, disparities), np.uint8),
+        memory.array("leasts", (rows, columns), np.uint32),
+        found.winners,
+        found.costs,
+        found.right_winners,
+    )
     return found
-
-
-def _memory_of(size: int) -> ByteArray:
-    """At least so many bytes, used before if possible: touching fresh memory takes as long as matching."""
-    try:
-        memory = _spare.pop()  # of one piece for each thread that ever matched; threads do not get the same one
-    except IndexError:
-        memory = np.empty(0, np.uint8)
-    if memory.size < size:
-        del memory  # before the next is asked for
-        memory = np.empty(size, np.uint8)
-    return memory
 
 
 @cache

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from cosp.arrays import BoolArray, ByteArray
 from cosp.dense import kernels
+from cosp.dense.memory import Workspace
 
 _log = logging.getLogger(__name__)
 
 
-def left_census(image: ByteArray) -> NDArray[np.uint16]:
+def left_census(image: ByteArray, memory: Workspace | None = None) -> NDArray[np.uint16]:
     """Census of the left picture, 7 x 9 neighbours in planes of words.
 
     Parameters
@@ -24,6 +25,8 @@ def left_census(image: ByteArray) -> NDArray[np.uint16]:
     image : (rows, columns) array, contiguous
         Grey values; 0 is no data. Where the window reaches it, the pixel becomes a pattern that is equally unlike
         everything: the edges of two films look like each other, wherever they lie on the ground.
+    memory : Workspace
+        Where the result lies, which then lasts until it is used for the next.
 
     Returns
     -------
@@ -34,12 +37,12 @@ def left_census(image: ByteArray) -> NDArray[np.uint16]:
     ----------
     [Zabih1994].
     """
-    return _census(image, kernels.LEFT_BLANK)
+    return _census(image, kernels.LEFT_BLANK, "left census", memory or Workspace())
 
 
-def right_census(image: ByteArray) -> NDArray[np.uint16]:
+def right_census(image: ByteArray, memory: Workspace | None = None) -> NDArray[np.uint16]:
     """Census of the right picture; see `left_census`."""
-    return _census(image, kernels.RIGHT_BLANK)
+    return _census(image, kernels.RIGHT_BLANK, "right census", memory or Workspace())
 
 
 def lacks_data(image: ByteArray) -> BoolArray:
@@ -50,8 +53,8 @@ def lacks_data(image: ByteArray) -> BoolArray:
     return np.asarray(least == 0)
 
 
-def _census(image: ByteArray, blank: int) -> NDArray[np.uint16]:
-    planes = np.empty((kernels.PLANES, *image.shape), np.uint16)
+def _census(image: ByteArray, blank: int, name: str, memory: Workspace) -> NDArray[np.uint16]:
+    planes: NDArray[np.uint16] = memory.array(name, (kernels.PLANES, *image.shape), np.uint16)
     wide_enough = image.shape[1] >= kernels.CENSUS_BLOCK + kernels.CENSUS_COLUMNS - 1
     transform = _transform() if wide_enough else kernels.census_plain
     transform(image, planes)

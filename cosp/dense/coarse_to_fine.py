@@ -20,6 +20,7 @@ from cosp.arrays import BoolArray, ByteArray, Float32Array
 from cosp.dense import kernels
 from cosp.dense.aggregation import aggregate_costs
 from cosp.dense.census import left_census, right_census
+from cosp.dense.memory import Workspace, workspace
 from cosp.dense.resampling import SmoothField, picture_pyramid, prior_of, resample_right
 from cosp.dense.selection import DisparityMap, select_disparities
 from cosp.dense.validity import Validity, correlation, doubly_claimed, no_data, picture_validity, speckles, uniqueness
@@ -156,20 +157,22 @@ def match(
 
         def finish(window: Window) -> None:
             grown = window.grown(HALO_PX, left.shape)
-            tile = _cleaned(
-                last,
-                grown,
-                _matched(last, grown, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
-                least_correlation=least_correlation,
-                least_uniqueness=least_uniqueness,
-                largest_speckle_px=largest_speckle_px,
-                speckle_step_px=speckle_step_px,
-            )
             inside = window.inside(grown).slices
-            result.disparity[window.slices] = tile.disparity[inside]
-            result.validity[window.slices] = tile.validity[inside]
-            result.confidence[window.slices] = tile.confidence[inside]
-            result.similarity[window.slices] = tile.similarity[inside]
+            with workspace() as memory:
+                tile = _cleaned(
+                    last,
+                    grown,
+                    _matched(last, grown, memory, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
+                    memory,
+                    least_correlation=least_correlation,
+                    least_uniqueness=least_uniqueness,
+                    largest_speckle_px=largest_speckle_px,
+                    speckle_step_px=speckle_step_px,
+                )
+                result.disparity[window.slices] = tile.disparity[inside]
+                result.validity[window.slices] = tile.validity[inside]
+                result.confidence[window.slices] = tile.confidence[inside]
+                result.similarity[window.slices] = tile.similarity[inside]
 
         _log.info("level 0: %d disparities", last.step.disparities)
         _over_tiles(finish, left.shape, tile_px, pool)
@@ -221,7 +224,8 @@ def _coarse_to_fine(
 
         def keep(window: Window, task: _Task = task, coarse: Float32Array = coarse) -> None:
             grown = window.grown(HALO_PX, coarse.shape)
-            coarse[window.slices] = _matched(task, grown).disparity[window.inside(grown).slices]
+            with workspace() as memory:
+                coarse[window.slices] = _matched(task, grown, memory).disparity[window.inside(grown).slices]
 
         _log.info("level %d: %d disparities", step.level, step.disparities)
         # The volume of a tile stays the same.
@@ -282,7 +286,7 @@ def _over_tiles(
 
 
 def _matched(
-    task: _Task, window: Window, *, least_texture_sd: float | None = None, saturated_from: int = 256
+    task: _Task, window: Window, memory: Workspace, *, least_texture_sd: float | None = None, saturated_from: int = 256
 ) -> DisparityMap:
     """One pass in one window. Without a least texture only data and consistency are asked for, as a prior needs."""
     left = np.ascontiguousarray(task.left[window.slices])
@@ -298,10 +302,16 @@ def _matched(
         prior = np.full(wide.shape, (low + high) / 2, np.float32)
     else:
         finer = task.before_level != task.step.level
-        prior = prior_of(task.before, wide, finer=finer, otherwise=(low + high) / (4 if finer else 2))
+        prior = prior_of(task.before, wide, finer=finer, otherwise=(low + high) / (4 if finer else 2), memory=memory)
         np.clip(prior, low, high, out=prior)
     right = resample_right(
-        task.right, prior, wide.row0, wide.column0, y_parallax=task.y_parallax, level=task.step.level
+        task.right,
+        prior,
+        wide.row0,
+        wide.column0,
+        y_parallax=task.y_parallax,
+        level=task.step.level,
+        memory=memory,
     )
     if least_texture_sd is None:
         left_validity = no_data(left, Validity.NO_DATA_LEFT)
@@ -312,11 +322,12 @@ def _matched(
             for image, flag in ((left, Validity.NO_DATA_LEFT), (right, Validity.NO_DATA_RIGHT))
         )
     found = aggregate_costs(
-        left_census(left),
-        right_census(right),
+        left_census(left, memory),
+        right_census(right, memory),
         disparities=disparities,
         small_step=task.small_step,
         large_step=task.large_step,
+        memory=memory,
     )
     return select_disparities(
         found,
@@ -325,6 +336,7 @@ def _matched(
         right_validity=right_validity,
         tolerated=0 if least_texture_sd is not None else int(Validity.AT_RANGE_EDGE),
         whole=least_texture_sd is not None,
+        memory=memory,
     )
 
 
@@ -332,6 +344,7 @@ def _cleaned(
     task: _Task,
     window: Window,
     tile: DisparityMap,
+    memory: Workspace,
     *,
     least_correlation: float,
     least_uniqueness: float,
@@ -341,13 +354,20 @@ def _cleaned(
     """Median of 5 x 5; what is not alike, what does not stand out and islands masked; disparities rounded."""
     if tile.validity.all():
         return tile
-    disparity = np.asarray(cv2.medianBlur(tile.disparity, 5), np.float32)
+    disparity: Float32Array = memory.array("median", tile.disparity.shape, np.float32)
+    cv2.medianBlur(tile.disparity, 5, dst=disparity)
     right = resample_right(
-        task.right, disparity, window.row0, window.column0, y_parallax=task.y_parallax, level=task.step.level
+        task.right,
+        disparity,
+        window.row0,
+        window.column0,
+        y_parallax=task.y_parallax,
+        level=task.step.level,
+        memory=memory,
     )
     kernels.clean(
         disparity,
-        correlation(np.ascontiguousarray(task.left[window.slices]), right),
+        correlation(np.ascontiguousarray(task.left[window.slices]), right, memory),
         uniqueness(tile.confidence),
         least_correlation,
         255 * least_uniqueness,

@@ -2,7 +2,8 @@
 
 Three of them, the census transform, the semi-global passes and the resampling, exist twice: in vector form, an
 `@intrinsic` that emits LLVM vector code over many pixels or disparities at once, and as plain loops that say the same
-readably. Both give the same bits. LLVM lowers the vector form to whatever the machine has, from SSE2 to AVX-512 and NEON.
+readably. Both give the same bits. LLVM lowers the vector form to whatever the machine has, from SSE2 to AVX-512 and
+NEON.
 
 How the semi-global passes stay quick: path costs are bytes, brought to minimum zero at every pixel, so that a path
 never exceeds `large_step` + 62 and two of them add up within a byte. The first of two sweeps of four paths each leaves

@@ -12,6 +12,7 @@ import numpy as np
 
 from cosp.arrays import ByteArray, Float32Array
 from cosp.dense import kernels
+from cosp.dense.memory import Workspace
 from cosp.imaging.windows import Window
 
 _log = logging.getLogger(__name__)
@@ -42,7 +43,14 @@ class SmoothField:
 
 
 def resample_right(
-    right: ByteArray, prior: Float32Array, first_row: int, first_column: int, *, y_parallax: SmoothField, level: int
+    right: ByteArray,
+    prior: Float32Array,
+    first_row: int,
+    first_column: int,
+    *,
+    y_parallax: SmoothField,
+    level: int,
+    memory: Workspace | None = None,
 ) -> ByteArray:
     """Right picture as it would look had it no disparity but what `prior` does not know; 0 where it has no data.
 
@@ -54,6 +62,8 @@ def resample_right(
         Disparity of the tile whose first pixel is (first_row, first_column) of the left picture.
     y_parallax : SmoothField, px of level 0
         Right row minus left row.
+    memory : Workspace
+        Where the result lies, which then lasts until it is used for the next.
     """
     scale = 2.0**-level
     lowest, highest = float(y_parallax.values.min()) * scale, float(y_parallax.values.max()) * scale
@@ -73,7 +83,7 @@ def resample_right(
     )
     # Linear: as accurate here as cubic, quicker, and what has data never comes out as 0.
     source = np.pad(right[window.slices], kernels.RIM)
-    target = np.empty(prior.shape, np.uint8)
+    target: ByteArray = (memory or Workspace()).array("resampled", prior.shape, np.uint8)
     resample = _resample() if prior.shape[1] >= kernels.SAMPLE_BLOCK else kernels.resample_plain
     resample(
         source,
@@ -145,7 +155,9 @@ def median_of_given(disparity: Float32Array) -> Float32Array:
     return median
 
 
-def prior_of(disparity: Float32Array, window: Window, *, finer: bool, otherwise: float) -> Float32Array:
+def prior_of(
+    disparity: Float32Array, window: Window, *, finer: bool, otherwise: float, memory: Workspace | None = None
+) -> Float32Array:
     """What a pass knows beforehand in a window: the disparity of the pass before, whole, without outliers and smooth.
 
     Parameters
@@ -158,6 +170,8 @@ def prior_of(disparity: Float32Array, window: Window, *, finer: bool, otherwise:
         The level to come is the next finer one, so that numbers double too.
     otherwise : float
         What to take where the pass before found nothing at all, in pixels of its level.
+    memory : Workspace
+        Where the result lies, which then lasts until it is used for the next.
     """
     ratio = 2 if finer else 1
     around = Window(
@@ -170,7 +184,7 @@ def prior_of(disparity: Float32Array, window: Window, *, finer: bool, otherwise:
     if np.isnan(known).all():
         return np.full(window.shape, otherwise * ratio, np.float32)
     smooth = cv2.GaussianBlur(cv2.medianBlur(fill_holes(known), 5), (0, 0), 1.0)
-    prior = np.empty(window.shape, np.float32)
+    prior: Float32Array = (memory or Workspace()).array("prior", window.shape, np.float32)
     if finer:
         kernels.enlarge(smooth, window.row0 - 2 * around.row0, window.column0 - 2 * around.column0, prior)
         return prior

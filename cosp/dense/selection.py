@@ -9,6 +9,7 @@ import numpy as np
 from cosp.arrays import ByteArray, Float32Array
 from cosp.dense import kernels
 from cosp.dense.aggregation import Winners
+from cosp.dense.memory import Workspace
 from cosp.dense.validity import Validity
 
 
@@ -36,6 +37,7 @@ def select_disparities(
     right_validity: ByteArray,
     tolerated: int = 0,
     whole: bool = False,
+    memory: Workspace | None = None,
 ) -> DisparityMap:
     """Disparities of one picture, with validity bits for the doubtful ones.
 
@@ -53,11 +55,18 @@ def select_disparities(
         Bits in spite of which there is a disparity.
     whole : bool
         Put `prior` where there is no disparity, instead of NaN.
+    memory : Workspace
+        Where the result lies, which then lasts until it is used for the next.
     """
     shape = found.winners.shape
+    memory = memory or Workspace()
     result = DisparityMap(
-        np.empty(shape, np.float32), left_validity.copy(), np.empty(shape, np.uint8), np.zeros(shape, np.uint8)
+        memory.array("disparity", shape, np.float32),
+        left_validity.copy(),
+        memory.array("confidence", shape, np.uint8),
+        memory.array("similarity", shape, np.uint8),
     )
+    result.similarity[:] = 0
     kernels.select(
         found.winners,
         found.costs,

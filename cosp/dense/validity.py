@@ -11,6 +11,7 @@ import numpy as np
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from cosp.dense import kernels
 from cosp.dense.census import lacks_data
+from cosp.dense.memory import Workspace
 from cosp.geometry.statistics import summarise
 
 CORRELATION_WINDOW_PX = 15
@@ -74,12 +75,12 @@ def picture_validity(
     return bits | np.asarray(cv2.morphologyEx(flat, cv2.MORPH_CLOSE, around), np.uint8)
 
 
-def correlation(left: ByteArray, right: ByteArray) -> Float32Array:
+def correlation(left: ByteArray, right: ByteArray, memory: Workspace | None = None) -> Float32Array:
     """Normalised correlation of two pictures in the window about every pixel; 0 where one is flat.
 
     Grain and noise of two films have nothing in common, so this tells texture from what only looks like it.
     """
-    found = np.empty(left.shape, np.float32)
+    found: Float32Array = (memory or Workspace()).array("correlation", left.shape, np.float32)
     # A variance of a quarter grey value squared is the rounding of a flat picture.
     kernels.correlate_windows(left, right, CORRELATION_WINDOW_PX // 2, 0.25, found)
     return found

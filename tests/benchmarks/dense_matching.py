@@ -1,17 +1,21 @@
-"""Dense matching beside OpenCV's StereoSGBM, on pairs with known disparity: processor time and accuracy.
+"""Dense matching beside OpenCV's StereoSGBM and pandora, on pairs with known disparity: processor time and accuracy.
 
     python -m tests.benchmarks.dense_matching                     # spans of 64 and 256 px
     python -m tests.benchmarks.dense_matching --spans 64 256 1400 --rounds 5 --scale 2
+    python -m tests.benchmarks.dense_matching --spans 64 --pandora /elsewhere/bin/python
 
 Relief is fractal with a few rock steps; the right picture differs in gamma, contrast and illumination, both have their
 own grain, high ground is saturated snow. Every matcher runs in a process of its own, in turn, on one thread, its second
 call timed; medians over the rounds. OpenCV has penalties tuned on such pairs, and its disparities get the 5 x 5 median
-that ours contain, unpaid. Accuracy is over what both pictures see and is not snow, within the columns that OpenCV can
+that ours contain, unpaid. Pandora with libsgm (extra `oracle`) takes part where this or another interpreter has it, on
+the first rows alone. "y-parallax" is ours on the same pair with rows that do not match by 0.8 px (standard deviation),
+folded into the resampling. Accuracy is over what both pictures see and is not snow, within the columns that OpenCV can
 match.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -22,7 +26,7 @@ import cv2
 import numpy as np
 
 from cosp.dense.coarse_to_fine import match
-from cosp.dense.resampling import median_of_given
+from cosp.dense.resampling import SmoothField, median_of_given
 from cosp.geometry.statistics import nmad
 from tests.dense.synthetic import texture, warp
 
@@ -42,6 +46,10 @@ OURS = {
     "speckle_step_px": 1.5,
     "threads": 1,
 }
+PANDORA = (7, 12, 80)  # window, penalties
+PANDORA_ROWS = 300
+Y_PARALLAX_SD_PX = 0.8
+NODES_EVERY_PX = 32
 COLUMNS = ("method", "ns/px", "time/ours", "density", "bad1 %", "bad3 %", "NMAD px")
 
 
@@ -69,12 +77,18 @@ def make_pair(path, span, scale, seed):
     albedo = 0.42 + 0.08 * fractal(shape, rng, 3.0, 0.05) + contrast * texture(shape, rng, finest_px=0.7)
     ground = np.where(snow, 1.3, np.clip(albedo, 0.05, 1.2)) * (0.25 + 0.75 * shade)
     ground = cv2.GaussianBlur(ground, (0, 0), 0.6)
+    by_right = fractal(shape, rng, 4.0, 0.004)
+    by_right *= Y_PARALLAX_SD_PX / by_right.std()
+    columns = np.arange(shape[1])
+    by_left = np.array([np.interp(columns + d, columns, line) for d, line in zip(disparity, by_right, strict=True)])
     right, seen = warp(ground, disparity)
-    right = np.where(np.isnan(right), 0.35, right)
+    moved, _ = warp(ground, disparity, y_parallax=by_right)
+    right, moved = (np.where(np.isnan(picture), 0.35, picture) for picture in (right, moved))
 
-    def film(values, gain, gamma, fog):
-        light = np.clip(values, 0, 4) ** gamma * gain + fog
-        light *= 1 + 0.12 * fractal(shape, rng, 3.5, 0.002)
+    lights = [1 + 0.12 * fractal(shape, rng, 3.5, 0.002) for _ in range(2)]
+
+    def film(values, gain, gamma, fog, light_falls):
+        light = (np.clip(values, 0, 4) ** gamma * gain + fog) * light_falls
         grain = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), 0.6)
         return np.clip(np.rint(255 * light + 3 * grain / grain.std()), 1, 255).astype(np.uint8)
 
@@ -83,16 +97,23 @@ def make_pair(path, span, scale, seed):
     judged[:16] = judged[-16:] = judged[:, :16] = False
     np.savez(
         path,
-        left=film(ground, 0.95, 1.0, 0.02),
-        right=film(right, 0.75, 1.25, 0.10),
+        left=film(ground, 0.95, 1.0, 0.02, lights[0]),
+        right=film(right, 0.75, 1.25, 0.10, lights[1]),
+        moved=film(moved, 0.75, 1.25, 0.10, lights[1]),
+        y_parallax=by_left[::NODES_EVERY_PX, ::NODES_EVERY_PX].astype(np.float32),
         disparity=disparity,
         judged=judged,
     )
 
 
-def matcher(method, span):
+def matcher(method, span, y_parallax):
     if method == "ours":
         return lambda left, right: match(left, right, (0, span), **OURS).disparity
+    if method == "y-parallax":
+        field = SmoothField(y_parallax, 0.0, 0.0, NODES_EVERY_PX, NODES_EVERY_PX)
+        return lambda left, right: match(left, right, (0, span), y_parallax=field, **OURS).disparity
+    if method == "pandora":
+        return lambda left, right: by_pandora(left, right, span)
     mode, block, small, large, cap = OPENCV[method]
     engine = cv2.StereoSGBM_create(
         minDisparity=-span,
@@ -113,17 +134,58 @@ def matcher(method, span):
     return run
 
 
+def by_pandora(left, right, span):
+    """Census and semi-global matching of pandora; its disparity has our sign."""
+    import pandora
+    import rasterio
+    from pandora.check_configuration import check_conf
+    from pandora.img_tools import create_dataset_from_inputs
+    from pandora.state_machine import PandoraMachine
+
+    window, small, large = PANDORA
+    with tempfile.TemporaryDirectory() as folder:
+        pictures = {}
+        for name, values, limits in (("left", left, [0, span]), ("right", right, [-span, 0])):
+            path = Path(folder, f"{name}.tif")
+            profile = {"height": left.shape[0], "width": left.shape[1], "count": 1, "dtype": "float32"}
+            with rasterio.open(path, "w", driver="GTiff", **profile) as file:
+                file.write(values.astype(np.float32), 1)
+            pictures[name] = {"img": str(path), "disp": limits, "nodata": -9999}
+        penalty = {"penalty_method": "sgm_penalty", "P1": small, "P2": large}
+        steps = {
+            "matching_cost": {"matching_cost_method": "census", "window_size": window, "subpix": 1},
+            "optimization": {"optimization_method": "sgm", "overcounting": False, "penalty": penalty},
+            "disparity": {"disparity_method": "wta", "invalid_disparity": "NaN"},
+            "refinement": {"refinement_method": "vfit"},
+            "validation": {"validation_method": "cross_checking_fast", "cross_checking_threshold": 1.0},
+        }
+        pandora.import_plugin()
+        machine = PandoraMachine()
+        read = {"left": pictures["left"], "right": {k: pictures["right"][k] for k in ("img", "nodata")}}
+        configuration = check_conf({"input": read, "pipeline": steps}, machine)
+        datasets = [create_dataset_from_inputs(pictures[name]) for name in ("left", "right")]
+        found, _ = pandora.run(machine, *datasets, configuration)
+    disparity = found["disparity_map"].values.astype(np.float32)
+    disparity[found["validity_mask"].values & (1 << 8 | 1 << 9) != 0] = np.nan
+    return disparity
+
+
 def run_once(path, method, span):
     """One matcher in this process: its processor time per pixel and its accuracy."""
     cv2.setNumThreads(1)
     with np.load(path) as pair:
-        left, right, disparity, judged = (pair[name] for name in ("left", "right", "disparity", "judged"))
-    work = matcher(method, span)
-    work(left, right)  # compiles, touches memory
+        names = ("left", "moved" if method == "y-parallax" else "right", "disparity", "judged")
+        rows = PANDORA_ROWS if method == "pandora" else None
+        left, right, disparity, judged = (np.ascontiguousarray(pair[name][:rows]) for name in names)
+        work = matcher(method, span, pair["y_parallax"])
+    if method == "pandora":
+        work(left[:50], right[:50])
+    else:
+        work(left, right)  # compiles, touches memory
     started = time.process_time()
     found = work(left, right)
     used = time.process_time() - started
-    if method != "ours":
+    if method in ("pandora", *OPENCV):
         found = median_of_given(found)
     given = judged & np.isfinite(found)
     error = (found - disparity)[given]
@@ -136,17 +198,21 @@ def run_once(path, method, span):
     }
 
 
-def compare(span, rounds, scale, seed):
-    methods = ["ours", *OPENCV] if span < 1000 else ["ours"]
+def compare(span, rounds, scale, seed, pandora):
+    methods = ["ours", "y-parallax", *OPENCV] if span < 1000 else ["ours", "y-parallax"]
+    if pandora and span < 100:
+        methods.append("pandora")
     results = {method: [] for method in methods}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "pair.npz")
         make_pair(path, span, scale, seed)
         for _ in range(rounds):
             for method in methods:
-                command = [sys.executable, "-m", __spec__.name, "--once", str(path), method, str(span)]
-                done = subprocess.run(command, capture_output=True, text=True, check=True)
-                results[method].append(json.loads(done.stdout))
+                program = pandora if method == "pandora" else sys.executable
+                command = [program, "-m", __spec__.name, "--once", str(path), method, str(span)]
+                one = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+                done = subprocess.run(command, capture_output=True, text=True, check=True, env=one)
+                results[method].append(json.loads(done.stdout.splitlines()[-1]))
     print(f"\nspan {span} px, {rounds} rounds, scale {scale}, seed {seed}")
     print("".join(f"{name:>11}" for name in COLUMNS))
     ours = np.median([r["ns"] for r in results["ours"]])
@@ -164,10 +230,11 @@ if __name__ == "__main__":
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--scale", type=float, default=1.0, help="of the number of pixels")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pandora", metavar="PYTHON", help="interpreter that has pandora and libsgm")
     parser.add_argument("--once", nargs=3, metavar=("PAIR", "METHOD", "SPAN"), help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.once:
         print(json.dumps(run_once(chosen.once[0], chosen.once[1], int(chosen.once[2]))))
     else:
         for span in chosen.spans:
-            compare(span, chosen.rounds, chosen.scale, chosen.seed)
+            compare(span, chosen.rounds, chosen.scale, chosen.seed, chosen.pandora)
