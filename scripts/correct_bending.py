@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosp.film.arrangement import Pose, posed
+from cosp.film.arrangement import laid
 from cosp.film.bending import choose_bending, film_grid, straighten
 from cosp.film.exposure import Exposure
 from cosp.film.joining import Layout
@@ -76,7 +76,12 @@ def correct_bending(
     grid = film_grid(exposure, half_length_mm=half_length_mm, half_width_mm=exposure.half_width_mm)
     windows = tiles(grid.shape, (grid.shape[0], 2048))
     layout = records.from_plain(seams["layout"], Layout, f"{seams_path}: layout")
-    parts = laid_parts(part_paths, seams)
+    parts = laid(
+        {Path(path).stem: rasters.read(path) for path in part_paths},
+        order=seams["part_order"],
+        turned=seams["turned"],
+        mirrored=seams["mirrored"],
+    )
 
     def straight(window):
         return straighten(parts, layout, grid, window, exposure, bending, turned=turned)
@@ -121,13 +126,6 @@ def correct_bending(
             ],
         },
     )
-
-
-def laid_parts(part_paths, seams):
-    """Parts as they lie in the joined film, left to right."""
-    by_name = {Path(path).stem: path for path in part_paths}
-    poses = [Pose(*pose) for pose in zip(seams["turned"], seams["mirrored"], strict=True)]
-    return [posed(rasters.read(by_name[name]), pose) for name, pose in zip(seams["part_order"], poses, strict=True)]
 
 
 def straightened(bending, x_mm, y_mm):

@@ -8,7 +8,7 @@ import pandas as pd
 
 from cosp.camera.missions import WIDTH_MM, mission_for
 from cosp.errors import InputError
-from cosp.film.arrangement import Pose, posed
+from cosp.film.arrangement import laid
 from cosp.film.exposure import find_exposure
 from cosp.film.joining import Layout, compose_reduced
 from cosp.film.rail_holes import find_rail_holes
@@ -49,7 +49,12 @@ def trace_stripes(
     mission = mission_for(camera)
     seams = records.read_json(seams_path)
     layout = records.from_plain(seams["layout"], Layout, f"{seams_path}: layout")
-    parts = laid_parts(part_paths, seams)
+    parts = laid(
+        {Path(path).stem: rasters.read(path) for path in part_paths},
+        order=seams["part_order"],
+        turned=seams["turned"],
+        mirrored=seams["mirrored"],
+    )
     factor = max(1, round(search_pixel_mm / pixel_mm))
     try:
         exposure = find_exposure(
@@ -114,13 +119,6 @@ def trace_stripes(
                 pd.DataFrame({"line": line, "side": side, "x_mm": x_mm, "y_mm": trace.y_mm, "strength": trace.strength})
             )
     tables.write(stripes_path, pd.concat(traced))
-
-
-def laid_parts(part_paths, seams):
-    """Parts as they lie in the joined film, left to right."""
-    by_name = {Path(path).stem: path for path in part_paths}
-    poses = [Pose(*pose) for pose in zip(seams["turned"], seams["mirrored"], strict=True)]
-    return [posed(rasters.read(by_name[name]), pose) for name, pose in zip(seams["part_order"], poses, strict=True)]
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +85,14 @@ def posed(part: ByteArray, pose: Pose) -> ByteArray:
     if pose.mirrored:
         part = part[::-1]
     return part[::-1, ::-1] if pose.turned else part
+
+
+def laid(
+    parts: Mapping[str, ByteArray], *, order: Sequence[str], turned: Sequence[bool], mirrored: Sequence[bool]
+) -> list[ByteArray]:
+    """Parts by their names as they lie in the joined film, left to right, as `seams.json` says it."""
+    poses = [Pose(*pose) for pose in zip(turned, mirrored, strict=True)]
+    return [posed(parts[name], pose) for name, pose in zip(order, poses, strict=True)]
 
 
 def arrange(

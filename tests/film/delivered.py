@@ -14,16 +14,7 @@ from cosp.film.bending import Bending
 from cosp.film.exposure import Exposure
 from cosp.film.joining import Layout
 from cosp.imaging.resampling import sample
-from cosp.simulation.defects import (
-    RAIL_HOLE_MM,
-    RAIL_HOLE_RADIUS_MM,
-    STRIPE_HALF_WIDTH_MM,
-    STRIPE_MM,
-    FilmTruth,
-    Part,
-    draw_strokes,
-    make_film,
-)
+from cosp.simulation import defects
 from cosp.simulation.orbit import FILM_HALF_WIDTH_MM, HALF_LENGTH_MM, HALF_WIDTH_MM
 from cosp.simulation.site import ScenePlan, SiteSettings
 from tests.film.synthetic import texture
@@ -66,7 +57,7 @@ class Delivered:
 
     settings: SiteSettings
     look: str
-    truth: FilmTruth
+    truth: defects.FilmTruth
     wishes: Wishes
     parts: tuple[ByteArray, ...]
 
@@ -78,7 +69,7 @@ class Delivered:
 def deliver(settings: SiteSettings, look: str, wishes: Wishes, *, number: int = 0) -> Delivered:
     """Expose, deform, digitise and muddle a film; the same for the same arguments."""
     scene = ScenePlan(f"DS1104-2169D{look[0].upper()}{92 + number:03d}", look, number, None, None, settings.seed)  # type: ignore[arg-type]
-    truth = make_film(settings, scene)
+    truth = defects.make_film(settings, scene)
     rng = np.random.default_rng([settings.seed, 77, number])
     pixel_mm = settings.pixel_um / 1000
     ground = _ground(pixel_mm, truth, wishes, rng)
@@ -86,12 +77,14 @@ def deliver(settings: SiteSettings, look: str, wishes: Wishes, *, number: int = 
     parts = []
     for part, pose in zip(truth.parts, wishes.poses, strict=True):
         image = _digitise(part, truth, settings, ground, gaps, rng)
-        draw_strokes(image, part, 0, truth.strokes)
+        defects.draw_strokes(image, part, 0, truth.strokes)
         parts.append(np.ascontiguousarray(posed(image, pose)))
     return Delivered(settings, look, truth, wishes, tuple(parts))
 
 
-def _ground(pixel_mm: float, truth: FilmTruth, wishes: Wishes, rng: np.random.Generator) -> np.ndarray[Any, Any]:
+def _ground(
+    pixel_mm: float, truth: defects.FilmTruth, wishes: Wishes, rng: np.random.Generator
+) -> np.ndarray[Any, Any]:
     """Grey values over the format, in the fore sense, at the pixels of the digitisation."""
     shape = (round(2 * HALF_WIDTH_MM / pixel_mm), round(2 * HALF_LENGTH_MM / pixel_mm))
     grey = 30.0 + 190.0 * texture(shape, rng)
@@ -112,7 +105,12 @@ def _ground(pixel_mm: float, truth: FilmTruth, wishes: Wishes, rng: np.random.Ge
 
 
 def _digitise(
-    part: Part, truth: FilmTruth, settings: SiteSettings, ground: Any, gaps: Any, rng: np.random.Generator
+    part: defects.Part,
+    truth: defects.FilmTruth,
+    settings: SiteSettings,
+    ground: Any,
+    gaps: Any,
+    rng: np.random.Generator,
 ) -> ByteArray:
     pixel_mm = part.pixel_mm
     rows, columns = part.shape
@@ -148,11 +146,13 @@ def _digitise(
     grey += cover(HALF_LENGTH_MM - np.abs(x)) * cover(HALF_WIDTH_MM - np.abs(y)) * (picture - 26.0)
     if settings.camera == "KH-4B":
         seen = (np.abs(x) < HALF_LENGTH_MM + 4) & ~((y > 0) & gaps[np.clip((x // 20 + 19).astype(int), 0, 37)])
-        share = min(1.0, 2 * STRIPE_HALF_WIDTH_MM / pixel_mm)
-        line = np.clip((STRIPE_HALF_WIDTH_MM - np.abs(np.abs(y) - STRIPE_MM)) / pixel_mm + 0.5, 0, share)
+        share = min(1.0, 2 * defects.STRIPE_HALF_WIDTH_MM / pixel_mm)
+        line = np.clip(
+            (defects.STRIPE_HALF_WIDTH_MM - np.abs(np.abs(y) - defects.STRIPE_MM)) / pixel_mm + 0.5, 0, share
+        )
         grey += seen * line * (190.0 - grey)
         along = x - 10.0 * np.floor(x / 10.0 + 0.5)
-        spot = cover(RAIL_HOLE_RADIUS_MM - np.hypot(along, np.abs(y) - RAIL_HOLE_MM))
+        spot = cover(defects.RAIL_HOLE_RADIUS_MM - np.hypot(along, np.abs(y) - defects.RAIL_HOLE_MM))
         grey += (np.abs(x) < HALF_LENGTH_MM + 8) * spot * (235.0 - grey)
     side = -y if truth.turned else y
     grey = np.where(np.abs(y) > FILM_HALF_WIDTH_MM, np.where(side < 0, 252.0, 14.0), grey)
@@ -272,7 +272,7 @@ def errors(
         return -found if turned else found
 
     x = np.linspace(-355.0, 355.0, 1421)
-    stripes = np.stack([straight(np.stack([x, np.full_like(x, s * STRIPE_MM)], axis=-1)) for s in (1, -1)])
+    stripes = np.stack([straight(np.stack([x, np.full_like(x, s * defects.STRIPE_MM)], axis=-1)) for s in (1, -1)])
     middle = straight(np.stack([x, np.zeros_like(x)], axis=-1))
     sense = np.sign([np.ptp(middle[:, 0]) and middle[-1, 0] - middle[0, 0], stripes[0, 0, 1] - stripes[1, 0, 1]])
     rest = stripes[..., 1] - stripes[..., 1].mean(axis=1, keepdims=True)
