@@ -6,6 +6,7 @@ rule match_dense:
         rectification="results/pairs/{pair}/rectification.json",
     output:
         disparity=temp("results/pairs/{pair}/disparity/{scatteritem}.tif"),
+        validity=temp("results/pairs/{pair}/validity/{scatteritem}.tif"),
     log:
         "logs/match_dense/{pair}_{scatteritem}.log",
     benchmark:
@@ -28,11 +29,18 @@ rule match_dense:
 
 rule merge_disparity:
     input:
-        strips=gather.match_dense("results/pairs/{{pair}}/disparity/{scatteritem}.tif"),
+        disparity=gather.match_dense("results/pairs/{{pair}}/disparity/{scatteritem}.tif"),
+        validity=gather.match_dense("results/pairs/{{pair}}/validity/{scatteritem}.tif"),
     output:
         disparity="results/pairs/{pair}/disparity.tif",
         validity="results/pairs/{pair}/validity.tif",
         summary="results/pairs/{pair}/disparity.json",
+        figure=report(
+            "results/pairs/{pair}/disparity.png",
+            caption="../docs/captions/disparity.rst",
+            category="Matching",
+            labels={"pair": "{pair}", "figure": "disparity and confidence"},
+        ),
     log:
         "logs/merge_disparity/{pair}.log",
     benchmark:

@@ -1,4 +1,4 @@
-"""Match one strip of an epipolar pair densely: disparity, validity and confidence of its rows."""
+"""Match one strip of an epipolar pair densely: disparity, validity, confidence and similarity of its rows."""
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from cosp.io import rasters, records
 from cosp.io.logs import log_to
 
 SMOOTH_BAND = 2  # of y_parallax.tif
+VALIDITY_BANDS = ("validity", "confidence", "similarity")
 
 
 def match_dense(
@@ -17,6 +18,7 @@ def match_dense(
     y_parallax_path,
     rectification_path,
     disparity_path,
+    validity_path,
     *,
     strip,
     small_step,
@@ -55,17 +57,13 @@ def match_dense(
     )
 
     inside = wanted.inside(seen).slices
+    place = {"grid": header.grid.window(first, last, 0, columns), "crs": header.crs}
+    rasters.write(disparity_path, found.disparity[inside], **place, descriptions=("disparity",))
     with rasters.create(
-        disparity_path,
-        shape=wanted.shape,
-        dtype=np.float32,
-        grid=header.grid.window(first, last, 0, columns),
-        crs=header.crs,
-        count=4,
-        descriptions=("disparity", "validity", "confidence", "similarity"),
-    ) as strip_file:
-        for band, values in enumerate((found.disparity, found.validity, found.confidence, found.similarity), start=1):
-            strip_file.write(None, values[inside].astype(np.float32, copy=False), band)
+        validity_path, shape=wanted.shape, dtype=np.uint8, **place, count=3, descriptions=VALIDITY_BANDS
+    ) as validity_file:
+        for band, values in enumerate((found.validity, found.confidence, found.similarity), start=1):
+            validity_file.write(None, values[inside], band)
 
 
 def smooth_y_parallax(y_parallax_path, fore_grid):
@@ -89,6 +87,7 @@ if __name__ == "__main__":
             y_parallax_path=snakemake.input.y_parallax,
             rectification_path=snakemake.input.rectification,
             disparity_path=snakemake.output.disparity,
+            validity_path=snakemake.output.validity,
             strip=snakemake.params.scatteritem,
             small_step=snakemake.params.small_step,
             large_step=snakemake.params.large_step,

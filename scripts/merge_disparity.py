@@ -1,4 +1,4 @@
-"""Join the strips of a pair's dense matching into one disparity and one validity raster."""
+"""Join the strips of a pair's dense matching into one disparity and one validity raster, with a picture of both."""
 
 import numpy as np
 
@@ -7,18 +7,26 @@ from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
+from cosp.report.disparity import draw_disparity
+from cosp.report.figures import save
 
 ROWS_AT_ONCE = 512
-SAMPLED_EVERY = 8  # row and column, for the statistics of disparity
+SAMPLED_EVERY = 8  # row and column, for the statistics of disparity and the picture; more for long films
+LONGEST_PICTURE_PX = 4000
 
 
-def merge_disparity(strip_paths, disparity_path, validity_path, summary_path):
-    headers = {path: rasters.info(path) for path in strip_paths}
+def merge_disparity(
+    disparity_strips, validity_strips, disparity_path, validity_path, summary_path, figure_path, *, title
+):
     # Rows of the strips step the same way, so the order along y is the order of rows.
-    ordered = sorted(strip_paths, key=lambda path: headers[path].grid.y0 / headers[path].grid.step_y)
-    top = headers[ordered[0]]
+    ordered = sorted(
+        ((rasters.info(one), one, other) for one, other in zip(disparity_strips, validity_strips, strict=True)),
+        key=lambda strip: strip[0].grid.y0 / strip[0].grid.step_y,
+    )
+    top = ordered[0][0]
     columns = top.shape[1]
-    shape = (sum(headers[path].shape[0] for path in ordered), columns)
+    shape = (sum(header.shape[0] for header, _, _ in ordered), columns)
+    sampled_every = max(SAMPLED_EVERY, -(-max(shape) // LONGEST_PICTURE_PX))
     grid = PixelGrid(top.grid.x0, top.grid.y0, top.grid.step_x, top.grid.step_y, shape)
 
     validity_counts, samples = np.zeros(256, np.int64), []
@@ -42,32 +50,34 @@ def merge_disparity(strip_paths, disparity_path, validity_path, summary_path):
         ) as validity_file,
     ):
         row = 0
-        for path in ordered:
-            rows = headers[path].shape[0]
-            for start in range(0, rows, ROWS_AT_ONCE):
-                stop = min(start + ROWS_AT_ONCE, rows)
-                disparity, validity, confidence, similarity = rasters.read(
-                    path, band=None, window=Window(start, stop, 0, columns)
-                )
-                window = Window(row + start, row + stop, 0, columns)
+        for header, disparity_strip, validity_strip in ordered:
+            for start in range(0, header.shape[0], ROWS_AT_ONCE):
+                part = Window(start, min(start + ROWS_AT_ONCE, header.shape[0]), 0, columns)
+                disparity = rasters.read(disparity_strip, window=part)
+                bands = rasters.read(validity_strip, band=None, window=part)
+                window = Window(row + part.row0, row + part.row1, 0, columns)
                 disparity_file.write(window, disparity)
-                validity = validity.astype(np.uint8)
-                validity_file.write(window, validity, 1)
-                validity_file.write(window, confidence.astype(np.uint8), 2)
-                validity_file.write(window, similarity.astype(np.uint8), 3)
-                validity_counts += np.bincount(validity.ravel(), minlength=256)
-                samples.append(disparity[::SAMPLED_EVERY, ::SAMPLED_EVERY].ravel())
-            row += rows
+                for number, values in enumerate(bands, start=1):
+                    validity_file.write(window, values, number)
+                validity_counts += np.bincount(bands[0].ravel(), minlength=256)
+                sampled = (slice(None, None, sampled_every), slice(None, None, sampled_every))
+                samples.append((disparity[sampled], bands[1][sampled], bands[2][sampled]))
+            row += header.shape[0]
 
-    summary = summarise_disparity(validity_counts, np.concatenate(samples))
+    disparity, confidence, similarity = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    save(draw_disparity(disparity, confidence, similarity, title=title), figure_path)
+    summary = summarise_disparity(validity_counts, disparity)
     records.write(summary_path, {"kind": "disparity_summary", "version": 1, **summary})
 
 
 if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         merge_disparity(
-            strip_paths=list(snakemake.input.strips),
+            disparity_strips=list(snakemake.input.disparity),
+            validity_strips=list(snakemake.input.validity),
             disparity_path=snakemake.output.disparity,
             validity_path=snakemake.output.validity,
             summary_path=snakemake.output.summary,
+            figure_path=snakemake.output.figure,
+            title=snakemake.wildcards.pair,
         )

@@ -73,6 +73,7 @@ if __name__ == "__main__":
             chosen.pair / "y_parallax.tif",
             chosen.folder / "range.json",
             chosen.folder / f"disparity_{strip}.tif",
+            chosen.folder / f"validity_{strip}.tif",
             strip=f"{strip}-of-{chosen.strips}",
             **{**OURS, "threads": chosen.threads},
         )

@@ -1,6 +1,7 @@
 import importlib.util
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -50,12 +51,20 @@ def test_strips_join_to_what_the_whole_gives(folder, settings):
             folder / "y.tif",
             folder / "rectification.json",
             strips[-1],
+            folder / f"{strip}_validity.tif",
             strip=strip,
             **settings,
         )
     function_of("merge_disparity")(
-        strips[::-1], folder / "disparity.tif", folder / "validity.tif", folder / "disparity.json"
+        strips[::-1],
+        [folder / f"{path.stem}_validity.tif" for path in strips[::-1]],
+        folder / "disparity.tif",
+        folder / "validity.tif",
+        folder / "disparity.json",
+        folder / "disparity.png",
+        title="a pair",
     )
+    assert cv2.imread(str(folder / "disparity.png")).std() > 10
     disparity = rasters.read(folder / "disparity.tif")
     validity, confidence, similarity = rasters.read(folder / "validity.tif", band=None)
     assert disparity.shape == pair.left.shape
