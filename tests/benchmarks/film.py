@@ -191,7 +191,8 @@ def table(path, count, pixel_um):
     for by in ("stripes", "edges", "none"):
         counted(f"straightened by {by}", lambda film, by=by: film.get("source") == by)
     # Seams: (weak, stepped).
-    for name, kind in {"textured": (0, 0), "weak": (1, 0), "with scanner steps": (0, 1)}.items():
+    kinds = {"textured": (0, 0), "weak": (1, 0), "with scanner steps": (0, 1), "weak, with scanner steps": (1, 1)}
+    for name, kind in kinds.items():
         row(
             f"seam, {name} (px)",
             lambda film, kind=kind: [
