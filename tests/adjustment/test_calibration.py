@@ -7,10 +7,10 @@ import pytest
 
 from cosp.adjustment import fieldprior
 from cosp.adjustment.blocks import orient_block
-from cosp.adjustment.calibration import FieldChoices, calibrate
+from cosp.adjustment.calibration import CELL_MM, FieldChoices, _cell_sums, calibrate, unmodelled_mm
 from cosp.adjustment.observations import FIELD_PRIORS, HeightReference, orbit_coupling
 from cosp.adjustment.posterior import HeightSigma, height_sigma
-from cosp.adjustment.rows import height_rows, intersections
+from cosp.adjustment.rows import Rows, height_rows, intersections
 from cosp.camera.field import FilmField
 from cosp.geometry.rays import meet
 from tests.adjustment.simulated import (
@@ -250,3 +250,37 @@ def test_successive_frames_of_one_camera_move_alike():
 def test_sigmas_between_their_places_are_linear():
     sigma = HeightSigma("film", np.array([0.0, 10.0]), np.array([0.0, 10.0]), np.array([[1.0, 2.0], [3.0, 4.0]]), 0.0)
     np.testing.assert_allclose(sigma.at(np.array([[5.0, 5.0], [-9.0, 0.0], [10.0, 99.0]])), [2.5, 1.0, 4.0])
+
+
+def heights_of_cells(rng, common_mm, *, cells=400, points=20, noise_mm=0.01):
+    """Height equations of points in cells of film, whose errors are alike by `common_mm`, with sigmas of 5 m."""
+    metres_per_mm, sigma_m = 300.0, 5.0
+    corner = CELL_MM * np.stack(np.divmod(np.arange(cells), 5), axis=-1)
+    film = np.repeat(corner, points, axis=0) + rng.uniform(0.0, CELL_MM, (cells * points, 2))
+    error_mm = np.repeat(rng.normal(0.0, common_mm, cells), points) + rng.normal(0.0, noise_mm, len(film))
+    by_film = np.full((len(film), 1, 2, 2), 0.5 * metres_per_mm / sigma_m)  # four displacements: a length of one
+    return Rows(
+        kind="dem",
+        images=(0, 1),
+        residuals=(metres_per_mm * error_mm / sigma_m)[:, None],
+        by_film=by_film,
+        film_by_camera=np.zeros((len(film), 2, 2, 13)),
+        imaged_mm=np.stack([film, film], axis=1),
+    )
+
+
+@pytest.mark.parametrize("common_mm", [0.0, 0.002, 0.008])
+def test_what_cells_have_in_common_is_told_from_the_noise_of_their_points(common_mm):
+    rows = heights_of_cells(np.random.default_rng(30), common_mm)
+    found = unmodelled_mm([rows], [np.ones(len(rows.residuals))])
+    # Means of twenty points have 0.0022 mm of noise, whose variance is known to a fourteenth.
+    assert found == pytest.approx(common_mm, abs=0.0009)
+
+
+def test_sums_over_cells_keep_the_variance_of_independent_residuals_and_show_common_ones():
+    weights = np.ones(400 * 20)
+    alone = heights_of_cells(np.random.default_rng(31), 0.0)
+    alike = heights_of_cells(np.random.default_rng(31), 0.01)
+    single = np.var(alone.residuals)
+    assert np.var(_cell_sums(alone, weights)) / single == pytest.approx(1.0, abs=0.2)
+    assert np.var(_cell_sums(alike, weights)) / single == pytest.approx(21.0, rel=0.2)
