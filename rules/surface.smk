@@ -66,7 +66,7 @@ rule triangulate:
         rectification="results/pairs/{pair}/rectification.json",
         cameras=cameras_of_pair,
     output:
-        points=temp("results/pairs/{pair}/points.tif"),
+        ray_gap="results/pairs/{pair}/ray_gap.tif",
         summary="results/pairs/{pair}/points.json",
     log:
         "logs/triangulate/{pair}.log",
@@ -91,8 +91,10 @@ rule triangulate:
 
 rule grid_dem:
     input:
-        points="results/pairs/{pair}/points.tif",
+        disparity="results/pairs/{pair}/disparity.tif",
         validity="results/pairs/{pair}/validity.tif",
+        y_parallax="results/pairs/{pair}/y_parallax.tif",
+        rectification="results/pairs/{pair}/rectification.json",
         summary="results/pairs/{pair}/points.json",
         cameras=cameras_of_pair,
         height_sigma=block_file("height_sigma"),
@@ -114,8 +116,10 @@ rule grid_dem:
         library=house.script_digest("grid_dem"),
         crs=crs_of_site,
         resolution_m=of_site("dem_resolution_m"),
+        ray_spacing_mm=choices("triangulate")["ray_spacing_mm"],
         pair=lambda wildcards: wildcards.pair,
         fore=member("fore"),
+        aft=member("aft"),
     message:
         "Gridding the heights of {wildcards.pair}"
     script:

@@ -2,13 +2,13 @@
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 
 import numpy as np
 
 from cosp.adjustment.posterior import HeightSigma
 from cosp.camera.mapping import MapProjector
 from cosp.camera.panoramic import PanoramicCamera
+from cosp.epipolar.rectification import Rectification
 from cosp.geometry.frames import LocalFrame
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.mapping import utm_crs
@@ -16,31 +16,49 @@ from cosp.imaging.windows import Window, tiles
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
 from cosp.surface.gridding import HALO_CELLS, boxes_meeting, grid_points, map_boxes
+from cosp.surface.intersection import PixelIntersection
 
 CONFIDENCE_BAND = 2  # of validity.tif
+SMOOTH_BAND = 2  # of y_parallax.tif: the field that dense matching allowed for
 MOST_CONFIDENCE = 255
 TILE_M = 5000.0  # ground of one job of a thread: about five million points of a 7 um film
+WINDOWS_AT_HAND = 40  # whose points are kept for the tiles to come: about 25 MB each
 
 
 def grid_dem(
-    points_path,
+    disparity_path,
     validity_path,
+    y_parallax_path,
+    rectification_path,
+    fore_camera_path,
+    aft_camera_path,
     summary_path,
     dem_path,
     sigma_path,
     *,
     crs,
     resolution_m,
+    ray_spacing_mm,
     kernel_cells,
     gate_sigmas,
     least_confidence,
     point_sigma_px,
     points_per_independent,
     threads,
-    camera_path=None,
     height_sigma_path=None,
 ):
     log = logging.getLogger("grid_dem")
+    rectification = records.read(rectification_path, Rectification)
+    fore = records.read(fore_camera_path, PanoramicCamera)
+    aft = records.read(aft_camera_path, PanoramicCamera).moved_to(fore.origin)
+    pixels = PixelIntersection.prepare(
+        rectification,
+        fore.rays,
+        aft.rays,
+        rasters.read(y_parallax_path, band=SMOOTH_BAND),
+        rasters.info(y_parallax_path).grid,
+        spacing_px=ray_spacing_mm / rectification.pixel_mm,
+    )
     summary = records.read_json(summary_path)
     frame = records.from_plain(summary["origin"], LocalFrame, f"{summary_path}: origin")
     if crs == "auto":
@@ -51,26 +69,31 @@ def grid_dem(
     grid = PixelGrid.covering((*boxes[:, :2].min(0), *boxes[:, 2:].max(0)), resolution_m)
     of_cameras = None
     if height_sigma_path is not None:
-        projector = MapProjector(records.read(camera_path, PanoramicCamera), crs, grid.bounds)
+        projector = MapProjector(fore, crs, grid.bounds)
         of_cameras = records.read(height_sigma_path, HeightSigma)
 
-    @lru_cache(maxsize=16)
     def map_points(number):
         """Points of a window on the map, and their weights: the noise of matching falls as confidence rises."""
         window = windows[number]
-        bands = rasters.read(points_path, band=None, window=window)
+        ground, miss_m = pixels.ground(window, rasters.read(disparity_path, window=window))
         confidence = rasters.read(validity_path, band=CONFIDENCE_BAND, window=window)
-        good = np.isfinite(bands[2]) & (confidence >= least_confidence)
-        local = np.stack([band[good] for band in bands[:3]], axis=-1)
-        return map_frame.map_from_local(local), (confidence[good] / np.float32(MOST_CONFIDENCE)) ** 2
+        with np.errstate(invalid="ignore"):
+            good = (miss_m <= summary["miss_limit_m"]) & (confidence >= least_confidence)
+        return map_frame.map_from_local(ground[good]), (confidence[good] / np.float32(MOST_CONFIDENCE)) ** 2
 
-    def heights(tile):
+    def with_halo(tile):
+        """A tile with what gridding needs around it, and its grid."""
         grown = Window(
             tile.row0 - HALO_CELLS, tile.row1 + HALO_CELLS, tile.column0 - HALO_CELLS, tile.column1 + HALO_CELLS
         )
-        part = grid.window(grown.row0, grown.row1, grown.column0, grown.column1)
+        return grown, grid.window(grown.row0, grown.row1, grown.column0, grown.column1)
+
+    at_hand = {}  # points of windows that tiles in work need, and of some that the next ones may
+
+    def heights(tile):
+        grown, part = with_halo(tile)
         chosen = boxes_meeting(boxes, part.bounds)
-        parts = [(np.empty((0, 3)), np.empty(0, np.float32)), *(map_points(number) for number in chosen)]
+        parts = [(np.empty((0, 3)), np.empty(0, np.float32)), *(at_hand[number] for number in chosen)]
         points, weights = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         found = grid_points(
             points,
@@ -106,6 +129,12 @@ def grid_dem(
     ):
         for start in range(0, len(every), threads):
             batch = every[start : start + threads]
+            needed = {number for tile in batch for number in boxes_meeting(boxes, with_halo(tile)[1].bounds)}
+            idle = [number for number in at_hand if number not in needed]
+            for number in idle[: max(len(idle) + len(needed) - WINDOWS_AT_HAND, 0)]:
+                del at_hand[number]
+            missing = sorted(needed - at_hand.keys())
+            at_hand.update(zip(missing, pool.map(map_points, missing), strict=True))
             for tile, (height_m, sigma_m, count, camera_sigma_m) in zip(batch, pool.map(heights, batch), strict=True):
                 dem.write(tile, height_m)
                 sigma.write(tile, sigma_m, 1)
@@ -118,19 +147,23 @@ def grid_dem(
 if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         grid_dem(
-            points_path=snakemake.input.points,
+            disparity_path=snakemake.input.disparity,
             validity_path=snakemake.input.validity,
+            y_parallax_path=snakemake.input.y_parallax,
+            rectification_path=snakemake.input.rectification,
+            fore_camera_path=f"{snakemake.input.cameras}/{snakemake.params.fore}.json",
+            aft_camera_path=f"{snakemake.input.cameras}/{snakemake.params.aft}.json",
             summary_path=snakemake.input.summary,
             dem_path=snakemake.output.dem,
             sigma_path=snakemake.output.sigma,
             crs=snakemake.params.crs,
             resolution_m=snakemake.params.resolution_m,
+            ray_spacing_mm=snakemake.params.ray_spacing_mm,
             kernel_cells=snakemake.params.kernel_cells,
             gate_sigmas=snakemake.params.gate_sigmas,
             least_confidence=snakemake.params.least_confidence,
             point_sigma_px=snakemake.params.point_sigma_px,
             points_per_independent=snakemake.params.points_per_independent,
             threads=snakemake.threads,
-            camera_path=f"{snakemake.input.cameras}/{snakemake.params.fore}.json",
             height_sigma_path=f"{snakemake.input.height_sigma}/{snakemake.params.pair}.json",
         )

@@ -1,98 +1,108 @@
-"""Ground points of conjugate film points, for every pixel of a pair."""
+"""Ground points of conjugate pixels, for every pixel of a pair."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from cosp.arrays import FloatArray
+from cosp.arrays import Float32Array, FloatArray
+from cosp.geometry.grids import PixelGrid
 from cosp.geometry.rays import Rays
-from cosp.imaging.windows import strips
+from cosp.imaging.windows import Window
 from cosp.surface import kernels
+from cosp.surface.nodes import between_nodes
 
-# Nodes across the film. Rays of a camera without distortion are exact between any; smooth distortion that changes over
-# some centimetres leaves less than a thousandth of a pixel between so many.
-_ACROSS = 65
 _LARGEST_ERROR_RAD = 2e-7  # a fiftieth of the pixel of a film digitised at 7 um
-_CHECKED_EVERY = 16  # places along, at which the table is held against rays between its nodes
+_CHECKED_EVERY = 8  # cells along, at which a table is held against rays between its nodes
+_BLOCK_NODES = 20_000  # nodes whose rays are asked for at a time
 
 
 @dataclass(frozen=True)
 class RayTable:
-    """The rays of a camera at the nodes of a lattice over its film.
+    """The rays of a camera at nodes over its rectified image.
 
-    Directions have the length that makes them linear along y: their component along the middle ray of their x is one.
+    Directions have the length that makes them linear along a row: their component along the middle ray of each row of
+    nodes is one.
 
     Parameters
     ----------
-    start_mm, step_mm : (x, y)
-        First node and distance of nodes.
-    values : (N, M, 6) array
-        Origin in metres and direction at each x and y.
+    nodes : PixelGrid
+        In pixels of the image, x its column and y its row.
+    values : (6, R, C) array
+        Origin in metres and direction at each node; NaN outside the film.
     """
 
-    start_mm: tuple[float, float]
-    step_mm: tuple[float, float]
+    nodes: PixelGrid
     values: FloatArray
 
-    @property
-    def scale(self) -> tuple[float, float, float, float]:
-        """Place among the nodes along x of x = 0 and its change per millimetre; the same along y."""
-        (x, y), (step_x, step_y) = self.start_mm, self.step_mm
-        return -x / step_x, 1 / step_x, -y / step_y, 1 / step_y
+    def scale(self, window: Window) -> tuple[float, float, float, float]:
+        """Row of nodes of the window's first row and change per pixel; the same for columns."""
+        row, column = self.nodes.pixels(np.array([window.column0, window.row0]))
+        return float(row), 1 / self.nodes.step_y, float(column), 1 / self.nodes.step_x
 
 
-def tabulate_rays(
-    rays: Callable[[FloatArray], Rays], *, half_length_mm: float, half_width_mm: float, places: int
-) -> RayTable:
+def nodes_over(low: tuple[float, float], high: tuple[float, float], *, spacing_px: float) -> PixelGrid:
+    """Nodes from a low (column, row) to a high one, both among them, at most so far apart."""
+    counts = [max(2, math.ceil((b - a) / spacing_px) + 1) for a, b in zip(low, high, strict=True)]
+    steps = [max(b - a, 1.0) / (n - 1) for a, b, n in zip(low, high, counts, strict=True)]
+    return PixelGrid(low[0], low[1], steps[0], steps[1], (counts[1], counts[0]))
+
+
+def tabulate_rays(rays: Callable[[FloatArray], Rays], nodes: PixelGrid) -> RayTable:
     """Table of the rays of one camera, whatever camera.
 
     Parameters
     ----------
     rays : function
-        Rays of film points (..., 2) in mm.
-    half_length_mm, half_width_mm : float
-        Half the film that will be asked for.
-    places : int
-        Number of x; linear between them. With 8192 on a whole film the error is below 0.1 mm on the ground.
+        Rays of places (..., 2) of the rectified image: column, row. NaN outside the film.
+    nodes : PixelGrid
+        Bilinear between them. 0.3 mm of film apart they leave less than a millimetre on the ground
+        where the film is without distortion.
 
     Raises
     ------
     ValueError
         The rays between the nodes are not those that the nodes say: such a table cannot stand for them.
     """
-    x = np.linspace(-half_length_mm, half_length_mm, places)
-    y = np.linspace(-half_width_mm, half_width_mm, _ACROSS)
-    sampled = rays(np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
-    middle = sampled.direction[:, _ACROSS // 2, :, None]
-    table = RayTable(
-        (-half_length_mm, -half_width_mm),
-        (2 * half_length_mm / (places - 1), 2 * half_width_mm / (_ACROSS - 1)),
-        np.concatenate([sampled.origin, sampled.direction / (sampled.direction @ middle)], axis=-1),
-    )
-
-    chosen = slice(None, -1, _CHECKED_EVERY)
-    node = table.values[..., 3:]
-    expected = node[:-1, :-1] + node[1:, :-1] + node[:-1, 1:] + node[1:, 1:]
-    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
-    between = rays(
-        np.stack(np.meshgrid(x[chosen] + table.step_mm[0] / 2, y[:-1] + table.step_mm[1] / 2, indexing="ij"), -1)
-    )
-    worst = float(np.linalg.norm(expected[chosen] - between.direction, axis=-1).max())
+    rows, columns = nodes.shape
+    values = np.empty((6, rows, columns))
+    worst = 0.0
+    height = max(1, _BLOCK_NODES // columns)
+    for row in range(0, rows, height):
+        # One more row of nodes than are written, so that every cell is looked into.
+        part = nodes.window(row, min(row + height + 1, rows), 0, columns)
+        sampled = rays(part.centres())
+        middle = sampled.direction[:, columns // 2, :, None]
+        node = np.concatenate([sampled.origin, sampled.direction / (sampled.direction @ middle)], axis=-1)
+        values[:, row : row + part.shape[0]] = np.moveaxis(node, -1, 0)
+        worst = max(worst, _error_between(rays, part, node[..., 3:]))
     if not worst < _LARGEST_ERROR_RAD:
         raise ValueError(
-            f"rays bend by {worst:.1e} rad between {places} x {_ACROSS} nodes of the film: no such table holds them"
+            f"rays bend by {worst:.1e} rad between {rows} x {columns} nodes of the image: no such table holds them"
         )
-    return table
+    return RayTable(nodes, values)
 
 
-def intersect_tabulated(
-    fore: RayTable, aft: RayTable, fore_mm: FloatArray, aft_mm: FloatArray, *, threads: int = 1
+def _error_between(rays: Callable[[FloatArray], Rays], nodes: PixelGrid, directions: FloatArray) -> float:
+    """Largest angle, in radians, between rays in the middle of some cells and what the nodes say of them."""
+    chosen = slice(None, None, _CHECKED_EVERY)
+    expected = directions[:-1, :-1] + directions[1:, :-1] + directions[:-1, 1:] + directions[1:, 1:]
+    expected = expected[:, chosen]
+    expected = expected / np.linalg.norm(expected, axis=-1, keepdims=True)
+    places = nodes.centres()[:-1, :-1][:, chosen] + np.array([nodes.step_x, nodes.step_y]) / 2
+    error = np.linalg.norm(expected - rays(places).direction, axis=-1)
+    known = error[np.isfinite(error)]
+    return float(known.max()) if known.size else 0.0
+
+
+def intersect_pixels(
+    fore: RayTable, aft: RayTable, window: Window, disparity: FloatArray, y_parallax: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Ground points of conjugate film points, and the gap their rays leave.
+    """Ground points of the pixels of a window, and the gap their rays leave.
 
     The same least-squares point as `cosp.geometry.rays.meet`, from tables.
 
@@ -100,46 +110,130 @@ def intersect_tabulated(
     ----------
     fore, aft : RayTable
         In one local frame.
-    fore_mm, aft_mm : (..., 2) arrays, mm
-        NaN for no correspondence.
-    threads : int
+    window : Window
+        Of the fore image.
+    disparity, y_parallax : (H, W) arrays, px
+        Aft column minus fore column, NaN for no correspondence; aft row minus fore row.
 
     Returns
     -------
-    ground : (..., 3) float64 array, m
+    ground : (H, W, 3) float64 array, m
         NaN outside the tables.
-    miss_m : (...) float64 array
+    miss_m : (H, W) float32 array
         Length of the common perpendicular.
 
     References
     ----------
     [Ghuffar2022] equation 13, in closed form.
     """
-    shape = fore_mm.shape[:-1]
-    fore_flat = np.ascontiguousarray(fore_mm, dtype=float).reshape(-1, 2)
-    aft_flat = np.ascontiguousarray(aft_mm, dtype=float).reshape(-1, 2)
-    ground, miss = np.empty((len(fore_flat), 3)), np.empty(len(fore_flat))
+    ground, miss = np.empty((*window.shape, 3)), np.empty(window.shape, np.float32)
+    kernels.intersect_pixels(
+        fore.values, fore.scale(window), aft.values, aft.scale(window), disparity, y_parallax, ground, miss
+    )
+    return ground, miss
 
-    def intersect(piece: tuple[int, int]) -> None:
-        part = slice(*piece)
-        kernels.intersect_tabulated(
-            fore.values,
-            fore.scale,
-            aft.values,
-            aft.scale,
-            fore_flat[part],
-            aft_flat[part],
-            ground[part],
-            miss[part],
+
+class RectifiedPair(Protocol):
+    """What is asked of a rectification (`cosp.epipolar.rectification.Rectification`)."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the fore image."""
+
+    @property
+    def disparity_range_px(self) -> tuple[float, float]:
+        """Lowest and highest disparity of all pixels."""
+
+    def fore_film(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """Fore film points (..., 2) of places of the fore image."""
+
+    def aft_film(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """Aft film points (..., 2) of places of the aft image."""
+
+    def disparity_bounds(self, rows: FloatArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Disparities of the lowest and the highest ground expected at fore pixels."""
+
+
+@dataclass(frozen=True)
+class PixelIntersection:
+    """Ground points of any window of a rectified pair, from its disparity.
+
+    Parameters
+    ----------
+    fore, aft : RayTable
+        In one local frame.
+    lowest, highest : (R, C) arrays, px
+        Disparities of the lowest and the highest ground expected, at the nodes of the fore rays; other ones are left
+        out.
+    y_parallax, y_parallax_nodes : (R, C) array, px, and PixelGrid
+        Aft row minus fore row at nodes of the fore image: what the rectification left.
+    """
+
+    fore: RayTable
+    aft: RayTable
+    lowest: FloatArray
+    highest: FloatArray
+    y_parallax: FloatArray
+    y_parallax_nodes: PixelGrid
+
+    @classmethod
+    def prepare(
+        cls,
+        pair: RectifiedPair,
+        fore_rays: Callable[[FloatArray], Rays],
+        aft_rays: Callable[[FloatArray], Rays],
+        y_parallax: FloatArray,
+        y_parallax_nodes: PixelGrid,
+        *,
+        spacing_px: float,
+    ) -> PixelIntersection:
+        """Tabulate the rays of both films over their rectified images.
+
+        Parameters
+        ----------
+        pair : RectifiedPair
+        fore_rays, aft_rays : functions
+            Rays of film points (..., 2) in mm, in one local frame.
+        y_parallax, y_parallax_nodes
+            As of the class; NaN is taken as none.
+        spacing_px : float
+            Largest distance of nodes.
+        """
+        rows, columns = pair.shape
+        y_parallax = np.nan_to_num(y_parallax)
+        slack = math.ceil(float(np.abs(y_parallax).max(initial=0.0))) + 1
+        low, high = pair.disparity_range_px
+        nodes = nodes_over((0, 0), (columns - 1, rows - 1), spacing_px=spacing_px)
+        centres = nodes.centres()
+        lowest, highest = pair.disparity_bounds(centres[..., 1], centres[..., 0])
+        return cls(
+            tabulate_rays(lambda place: fore_rays(pair.fore_film(place[..., 1], place[..., 0])), nodes),
+            tabulate_rays(
+                lambda place: aft_rays(pair.aft_film(place[..., 1], place[..., 0])),
+                nodes_over((low - 1, -slack), (columns + high, rows - 1 + slack), spacing_px=spacing_px),
+            ),
+            lowest,
+            highest,
+            y_parallax,
+            y_parallax_nodes,
         )
 
-    pieces = strips(len(fore_flat), threads)
-    if threads == 1:
-        intersect(pieces[0])
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(intersect, pieces))
-    return ground.reshape(*shape, 3), miss.reshape(shape)
+    def ground(self, window: Window, disparity: FloatArray) -> tuple[FloatArray, Float32Array]:
+        """Ground points (H, W, 3) in the local frame and gaps (H, W) of a window of the fore image, in metres."""
+        low, high = (self._at(values, self.fore.nodes, window) for values in (self.lowest, self.highest))
+        with np.errstate(invalid="ignore"):
+            likely = np.where((disparity >= low) & (disparity <= high), disparity, np.float32(np.nan))
+        smooth = self._at(self.y_parallax, self.y_parallax_nodes, window)
+        return intersect_pixels(self.fore, self.aft, window, likely, smooth)
+
+    @staticmethod
+    def _at(values: FloatArray, nodes: PixelGrid, window: Window) -> Float32Array:
+        """Values at nodes, at every pixel of a window."""
+        return between_nodes(
+            values,
+            (np.arange(window.row0, window.row1) - nodes.y0) / nodes.step_y,
+            (np.arange(window.column0, window.column1) - nodes.x0) / nodes.step_x,
+        )
 
 
 def miss_limit(miss_m: FloatArray, *, gate_sigmas: float, least_m: float) -> float:

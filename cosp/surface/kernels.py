@@ -9,82 +9,129 @@ from numba import njit
 
 from cosp.arrays import BoolArray, FloatArray, IntArray
 
+_CHUNK = 64  # pixels whose rays are intersected side by side
+
 
 @njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
-def intersect_tabulated(
+def intersect_pixels(
     fore_table: FloatArray,
     fore_scale: tuple[float, float, float, float],
     aft_table: FloatArray,
     aft_scale: tuple[float, float, float, float],
-    fore: FloatArray,
-    aft: FloatArray,
+    disparity: FloatArray,
+    y_parallax: FloatArray,
     ground: FloatArray,
     miss: FloatArray,
 ) -> None:
-    """Midpoints of the common perpendiculars of tabulated rays.
+    """Midpoints of the common perpendiculars of the tabulated rays of conjugate pixels.
 
-    A node of a table, (N, M, 6), holds origin and direction; the scales are (place along x at x = 0, per millimetre;
-    the same along y). Beyond the last node across, rays go on as between the last two. `fore` and `aft` are (N, 2)
-    film points; `ground` (N, 3) and `miss` (N,) are filled.
+    A table, (6, R, C), holds origin and direction at its nodes; the scales are (place among the nodes' rows of the
+    window's first row, rows of nodes per pixel, the same along columns). `disparity` and `y_parallax` are (H, W);
+    `ground` (H, W, 3) and `miss` (H, W) are filled, with NaN where a pixel has no disparity or lies outside a table.
     """
-    for n in range(fore.shape[0]):
-        u = fore_scale[0] + fore_scale[1] * fore[n, 0]
-        v = fore_scale[2] + fore_scale[3] * fore[n, 1]
-        s = aft_scale[0] + aft_scale[1] * aft[n, 0]
-        t = aft_scale[2] + aft_scale[3] * aft[n, 1]
-        inside = 0.0 <= u <= fore_table.shape[0] - 1 and 0.0 <= s <= aft_table.shape[0] - 1
-        if not inside or np.isnan(v) or np.isnan(t):
-            ground[n, 0] = np.nan
-            ground[n, 1] = np.nan
-            ground[n, 2] = np.nan
-            miss[n] = np.nan
-            continue
-        c0, c1, c2, a0, a1, a2 = _tabulated(fore_table, u, v)
-        w0, w1, w2, b0, b1, b2 = _tabulated(aft_table, s, t)
-        w0 = c0 - w0
-        w1 = c1 - w1
-        w2 = c2 - w2
+    height, width = disparity.shape
+    node_rows, node_columns = aft_table.shape[1], aft_table.shape[2]
+    flat = aft_table.reshape(-1)
+    plane = np.uint64(node_rows * node_columns)
+    down = np.uint64(node_columns)
+    one = np.uint64(1)
+    last_row, last_column = float(node_rows - 1), float(node_columns - 1)
+    line = np.empty((6, fore_table.shape[2]))
+    # Six values of the fore ray, six of the aft ray, the ground point and the gap of each pixel of a chunk.
+    chunk = np.zeros(16 * _CHUNK)
+    across = np.empty(_CHUNK)
+    along = np.empty(_CHUNK)
+    outside = np.empty(_CHUNK)
+    corner = np.empty(_CHUNK, np.int64)
+    for y in range(height):
+        _line_of_nodes(fore_table, fore_scale[0] + fore_scale[1] * y, line)
+        for start in range(0, width, _CHUNK):
+            count = min(_CHUNK, width - start)
+            _between_nodes_of_line(line, fore_scale[2] + fore_scale[3] * start, fore_scale[3], count, chunk)
+            for t in range(count):
+                x = start + t
+                row = aft_scale[0] + aft_scale[1] * (y + y_parallax[y, x])
+                column = aft_scale[2] + aft_scale[3] * (x + disparity[y, x])
+                inside = row >= 0.0 and row < last_row and column >= 0.0 and column < last_column
+                row = row if inside else 0.0
+                column = column if inside else 0.0
+                i, j = np.floor(row), np.floor(column)
+                along[t], across[t] = row - i, column - j
+                corner[t] = np.int64(i * node_columns + j)
+                outside[t] = 0.0 if inside else np.nan
+            for t in range(count):
+                w11 = along[t] * across[t]
+                w10 = along[t] - w11
+                w01 = across[t] - w11
+                w00 = 1.0 - along[t] - w01
+                upper = np.uint64(corner[t])
+                for k in range(6):
+                    lower = upper + down
+                    chunk[(6 + k) * _CHUNK + t] = (
+                        w00 * flat[upper] + w01 * flat[upper + one] + w10 * flat[lower] + w11 * flat[lower + one]
+                    )
+                    upper += plane
+            _meet(chunk)
+            for t in range(count):
+                for k in range(3):
+                    ground[y, start + t, k] = chunk[(12 + k) * _CHUNK + t] + outside[t]
+                miss[y, start + t] = chunk[15 * _CHUNK + t] + outside[t]
+
+
+@njit(nogil=True, cache=True)
+def _line_of_nodes(table: FloatArray, row: float, line: FloatArray) -> None:
+    """Values (6, C) of a table (6, R, C) on a row between its rows of nodes."""
+    i = min(max(int(row), 0), table.shape[1] - 2)
+    part = row - i
+    for k in range(6):
+        upper, lower = table[k, i], table[k, i + 1]
+        for j in range(line.shape[1]):
+            line[k, j] = upper[j] + part * (lower[j] - upper[j])
+
+
+@njit(nogil=True, cache=True)
+def _between_nodes_of_line(line: FloatArray, first: float, step: float, count: int, chunk: FloatArray) -> None:
+    """Values between the nodes of a line at places `step` apart, into the first six lines of a chunk."""
+    t = 0
+    while t < count:
+        j = min(int(first + t * step), line.shape[1] - 2)
+        stop = count
+        if j < line.shape[1] - 2:
+            stop = min(max(int(math.ceil((j + 1 - first) / step)), t + 1), count)
+        for k in range(6):
+            slope = line[k, j + 1] - line[k, j]
+            value = line[k, j] + slope * (first - j)
+            slope *= step
+            for u in range(t, stop):
+                chunk[k * _CHUNK + u] = value + slope * u
+        t = stop
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
+def _meet(chunk: FloatArray) -> None:
+    """Ground points and gaps, the last four lines of a chunk, of the pairs of rays in the first twelve."""
+    for t in range(_CHUNK):
+        a0, a1, a2 = chunk[3 * _CHUNK + t], chunk[4 * _CHUNK + t], chunk[5 * _CHUNK + t]
+        b0, b1, b2 = chunk[9 * _CHUNK + t], chunk[10 * _CHUNK + t], chunk[11 * _CHUNK + t]
+        w0 = chunk[t] - chunk[6 * _CHUNK + t]
+        w1 = chunk[_CHUNK + t] - chunk[7 * _CHUNK + t]
+        w2 = chunk[2 * _CHUNK + t] - chunk[8 * _CHUNK + t]
         aa = a0 * a0 + a1 * a1 + a2 * a2
         ab = a0 * b0 + a1 * b1 + a2 * b2
         bb = b0 * b0 + b1 * b1 + b2 * b2
         aw = a0 * w0 + a1 * w1 + a2 * w2
         bw = b0 * w0 + b1 * w1 + b2 * w2
         scale = 1.0 / (aa * bb - ab * ab)
-        s = (ab * bw - bb * aw) * scale
-        t = (aa * bw - ab * aw) * scale
+        p = (ab * bw - bb * aw) * scale
+        q = (aa * bw - ab * aw) * scale
         # Gap vector between the nearest points of both rays; half of it leads to the midpoint.
-        g0 = w0 + s * a0 - t * b0
-        g1 = w1 + s * a1 - t * b1
-        g2 = w2 + s * a2 - t * b2
-        ground[n, 0] = c0 + s * a0 - 0.5 * g0
-        ground[n, 1] = c1 + s * a1 - 0.5 * g1
-        ground[n, 2] = c2 + s * a2 - 0.5 * g2
-        miss[n] = math.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
-def _tabulated(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float, float, float]:
-    """Six values between the nodes of a table, bilinear."""
-    i = min(int(u), table.shape[0] - 2)
-    j = min(max(int(v), 0), table.shape[1] - 2)
-    p = u - i
-    q = v - j
-    w11 = p * q
-    w10 = p - w11
-    w01 = q - w11
-    w00 = 1.0 - p - w01
-    a = table[i, j]
-    b = table[i, j + 1]
-    c = table[i + 1, j]
-    d = table[i + 1, j + 1]
-    return (
-        w00 * a[0] + w01 * b[0] + w10 * c[0] + w11 * d[0],
-        w00 * a[1] + w01 * b[1] + w10 * c[1] + w11 * d[1],
-        w00 * a[2] + w01 * b[2] + w10 * c[2] + w11 * d[2],
-        w00 * a[3] + w01 * b[3] + w10 * c[3] + w11 * d[3],
-        w00 * a[4] + w01 * b[4] + w10 * c[4] + w11 * d[4],
-        w00 * a[5] + w01 * b[5] + w10 * c[5] + w11 * d[5],
-    )
+        g0 = w0 + p * a0 - q * b0
+        g1 = w1 + p * a1 - q * b1
+        g2 = w2 + p * a2 - q * b2
+        chunk[12 * _CHUNK + t] = chunk[t] + p * a0 - 0.5 * g0
+        chunk[13 * _CHUNK + t] = chunk[_CHUNK + t] + p * a1 - 0.5 * g1
+        chunk[14 * _CHUNK + t] = chunk[2 * _CHUNK + t] + p * a2 - 0.5 * g2
+        chunk[15 * _CHUNK + t] = math.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
 
 
 @njit(nogil=True, cache=True)

@@ -13,9 +13,10 @@ from scipy.stats import binned_statistic_2d
 
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.rays import meet
+from cosp.imaging.windows import Window
 from cosp.surface.gridding import grid_points
-from cosp.surface.intersection import intersect_tabulated, tabulate_rays
-from tests.surface.synthetic import camera
+from cosp.surface.intersection import intersect_pixels
+from tests.surface.synthetic import camera, conjugate_pixels, film_of, ray_table
 
 ROUNDS = 5
 
@@ -43,26 +44,34 @@ def interleaved(functions):
 
 def intersection(count, rng):
     fore, aft = camera("fore"), camera("aft")
-    ground = np.stack(
-        [rng.uniform(-9e4, 9e4, count), rng.uniform(-6e3, 6e3, count), rng.uniform(0, 6e3, count)], axis=-1
-    )
-    # Picture order: x changes slowly along a line of the rectified pair.
-    ground = ground[np.lexsort((ground[:, 1], ground[:, 0] // 40))]
-    films = [c.project(ground) for c in (fore, aft)]
-    tables = [tabulate_rays(c.rays, half_length_mm=372.0, half_width_mm=30.0, places=8192) for c in (fore, aft)]
-    few = count // 20
-    part = [film[:few] for film in films]
+    tables = ray_table(fore), ray_table(aft, rows=(-54_000, 54_000), columns=(-9000, 9000))
+    wide = 2048
+    # As the rule has it: windows of some hundred thousand pixels, 6 km of relief.
+    window = Window(20_000, 20_000 + min(count // wide, 512), -wide // 2, wide // 2)
+    rows, columns = np.meshgrid(*(np.arange(n) for n in window.shape), indexing="ij")
+    height_m = 3000 + 2900 * np.sin(rows / 300) * np.cos(columns / 410) + rng.normal(0, 20, window.shape)
+    ground, disparity, y_parallax = conjugate_pixels(fore, aft, window, height_m)
+    rows, columns = rows + window.row0, columns + window.column0
+    worst = np.nanmax(np.abs(intersect_pixels(*tables, window, disparity, y_parallax)[0] - ground))
+    disparity, y_parallax = disparity.astype(np.float32), y_parallax.astype(np.float32)
+    few = slice(0, max(window.shape[0] // 20, 1))
+    part = [
+        film_of(np.stack([c + dc, r + dr], axis=-1)).reshape(-1, 2)
+        for c, dc, r, dr in (
+            (columns[few], 0, rows[few], 0),
+            (columns[few], disparity[few], rows[few], y_parallax[few]),
+        )
+    ]
     times = interleaved(
         {
-            "tables, compiled": lambda: intersect_tabulated(*tables, *films),
+            "tables, compiled": lambda: intersect_pixels(*tables, window, disparity, y_parallax),
             "numpy, closed form": lambda: meet(fore.rays(part[0]), aft.rays(part[1])),
             "numpy, batched solve": lambda: normal_equations(fore.rays(part[0]), aft.rays(part[1])),
         }
     )
     for name, seconds in times.items():
-        done = count if name.startswith("tables") else few
+        done = disparity.size if name.startswith("tables") else len(part[0])
         print(f"intersection  {name:24s} {done / seconds / 1e6:8.2f} Mpoints/s")
-    worst = np.abs(intersect_tabulated(*tables, *films)[0] - ground).max()
     print(f"intersection  largest error of the tables {worst * 1000:.3f} mm")
 
 

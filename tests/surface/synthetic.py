@@ -8,6 +8,8 @@ import numpy as np
 
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.frames import LocalFrame
+from cosp.imaging.windows import Window
+from cosp.surface.intersection import RayTable, nodes_over, tabulate_rays
 
 ORIGIN = LocalFrame(11.2, 47.3)
 HEIGHT_M = 170e3
@@ -43,3 +45,30 @@ def terrain_m(easting, northing):
 def texture(easting, northing):
     """Grey values of the ground, smooth over some hundred metres."""
     return 128 + 50 * np.sin(easting / 130.0) * np.sin(northing / 150.0) + 30 * np.cos((easting - northing) / 310.0)
+
+
+PIXEL_MM = 0.007
+
+
+def film_of(place):
+    """Film points in mm of (column, row) of an image whose rows run across the film and whose row 0 is mid-scan."""
+    return place[..., ::-1] * PIXEL_MM
+
+
+def ray_table(seen_by, *, rows=(-52_000, 52_000), columns=(-4200, 4200), spacing_px=42.0) -> RayTable:
+    """Rays of a camera over such an image of its film."""
+    nodes = nodes_over((columns[0], rows[0]), (columns[1], rows[1]), spacing_px=spacing_px)
+    return tabulate_rays(lambda place: seen_by.rays(film_of(place)), nodes)
+
+
+def conjugate_pixels(fore, aft, window: Window, height_m):
+    """Ground points of the fore pixels of a window at heights, and the disparity and y-parallax of the aft pixels."""
+    place = np.stack(
+        np.meshgrid(
+            np.arange(window.column0, window.column1, dtype=float), np.arange(window.row0, window.row1, dtype=float)
+        ),
+        axis=-1,
+    )
+    ground_m = fore.locate(film_of(place), height_m)
+    moved = aft.project(ground_m)[..., ::-1] / PIXEL_MM - place
+    return ground_m, moved[..., 0], moved[..., 1]

@@ -26,7 +26,7 @@ from cosp.geometry.statistics import nmad
 from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 from cosp.surface.gridding import grid_points
-from cosp.surface.intersection import intersect_tabulated, tabulate_rays
+from cosp.surface.intersection import PixelIntersection
 
 GEOID_M = 50.4  # of EGM96 near Mont Ventoux above the ellipsoid
 _log = logging.getLogger(__name__)
@@ -159,14 +159,10 @@ def points_of_pair(fore, aft, heights_m):
     )
     field = SmoothField(after.smooth_px.astype(np.float32), nodes.y0, nodes.x0, nodes.step_y, nodes.step_x)
     found = match(*images, rectification.disparity_range_px, y_parallax=field, **DENSE)
-    rows, columns = np.arange(float(whole.row1))[:, None], np.arange(float(whole.column1))[None, :]
     # Here nothing but the correction of the rows is said about y-parallax.
-    fore_mm, aft_mm = rectification.conjugate_points(rows, columns, found.disparity)
-    tables = [
-        tabulate_rays(c.rays, half_length_mm=film.half_length_mm, half_width_mm=film.half_width_mm, places=257)
-        for c, film in zip((fore, aft), films, strict=True)
-    ]
-    ground, gap_m = intersect_tabulated(*tables, fore_mm, aft_mm)
+    none = np.zeros(nodes.shape, np.float32)
+    pixels = PixelIntersection.prepare(rectification, fore.rays, aft.rays, none, nodes, spacing_px=8.0)
+    ground, gap_m = pixels.ground(whole, found.disparity)
     return ground, gap_m, before.summary(), after.summary()
 
 

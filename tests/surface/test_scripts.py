@@ -23,11 +23,27 @@ CRS = "EPSG:32632"
 PIXEL_MM = 0.14
 FILM = {"half_length_mm": 28.0, "half_width_mm": 27.0}
 RESOLUTION_M = 80.0
+GRIDDING = {
+    "crs": "auto",
+    "resolution_m": RESOLUTION_M,
+    "ray_spacing_mm": 0.3,
+    "kernel_cells": 0.5,
+    "gate_sigmas": 5.0,
+    "least_confidence": 40,
+    "point_sigma_px": 0.1,
+    "points_per_independent": 1.0,
+}
 SHIFT_M = np.array([60.0, -35.0, 12.0])  # of the reference against the truth
 
 
 def function(name):
     return runpy.run_path(str(SCRIPTS / f"{name}.py"))[name]
+
+
+def inputs_of_gridding(folder):
+    names = "disparity.tif", "validity.tif", "y_parallax.tif", "rectification.json"
+    cameras = [f"{camera(look, **FILM).scene}.json" for look in ("fore", "aft")]
+    return [folder / name for name in (*names, *cameras, "points.json")]
 
 
 @pytest.fixture(scope="module")
@@ -99,27 +115,15 @@ def site(tmp_path_factory):
         folder / "rectification.json",
         folder / f"{fore.scene}.json",
         folder / f"{aft.scene}.json",
-        folder / "points.tif",
+        folder / "ray_gap.tif",
         folder / "points.json",
-        ray_places=2048,
+        ray_spacing_mm=0.3,
         gate_sigmas=6.0,
         gate_px=1.0,
         threads=2,
     )
     function("grid_dem")(
-        folder / "points.tif",
-        folder / "validity.tif",
-        folder / "points.json",
-        folder / "dem.tif",
-        folder / "dem_sigma.tif",
-        crs="auto",
-        resolution_m=RESOLUTION_M,
-        kernel_cells=0.5,
-        gate_sigmas=5.0,
-        least_confidence=40,
-        point_sigma_px=0.1,
-        points_per_independent=1.0,
-        threads=2,
+        *inputs_of_gridding(folder), folder / "dem.tif", folder / "dem_sigma.tif", **GRIDDING, threads=2
     )
     function("orthorectify")(
         folder / "fore.tif",
@@ -184,22 +188,12 @@ def site(tmp_path_factory):
 def test_the_standard_deviation_of_the_cameras_joins_that_of_matching(site):
     places = HeightSigma("film", np.array([-30.0, 30.0]), np.array([-30.0, 30.0]), np.array([[2.0, 4.0]] * 2), 1500.0)
     records.write(site / "height_sigma.json", places)
-    fore = camera("fore", **FILM)
     function("grid_dem")(
-        site / "points.tif",
-        site / "validity.tif",
-        site / "points.json",
+        *inputs_of_gridding(site),
         site / "dem_again.tif",
         site / "dem_sigma_again.tif",
-        crs="auto",
-        resolution_m=RESOLUTION_M,
-        kernel_cells=0.5,
-        gate_sigmas=5.0,
-        least_confidence=40,
-        point_sigma_px=0.1,
-        points_per_independent=1.0,
+        **GRIDDING,
         threads=1,
-        camera_path=site / f"{fore.scene}.json",
         height_sigma_path=site / "height_sigma.json",
     )
     matching = rasters.read(site / "dem_sigma.tif")
@@ -239,7 +233,13 @@ def test_points_say_what_a_pixel_is_worth_and_how_well_rays_meet(site):
     assert 60 < summary["height_per_px_m"] < 90  # 4.0 m at 7 um and 170 km, 20 times as much at 140 um
     assert summary["rejected"] == 0
     assert summary["miss_m"]["median"] < 1.0
-    assert summary["count"] == np.isfinite(rasters.read(site / "points.tif")).sum()
+    disparity = rasters.read(site / "disparity.tif")
+    # All but those at the rim of the films, and a percent that the noise put outside the heights expected.
+    assert 0.98 < summary["count"] / np.isfinite(disparity).sum() <= 1
+    gap_m = rasters.read(site / "ray_gap.tif")
+    assert np.isnan(gap_m[np.isnan(disparity[::16, ::16])]).all()
+    assert np.isfinite(gap_m).sum() > 0.98 * summary["count"] / 16**2
+    assert np.nanmedian(gap_m) == pytest.approx(summary["miss_m"]["median"], rel=0.05)
 
 
 def test_the_orthophoto_shows_the_ground(site):
