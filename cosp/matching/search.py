@@ -466,8 +466,8 @@ def _standardised(surfaces: Float32Array) -> tuple[Float32Array, BoolArray]:
     covered: BoolArray = np.asarray(np.isfinite(surfaces).all(axis=0))
     total = np.zeros(covered.shape, np.float32)
     for surface in surfaces:
-        spread = cv2.dilate(np.where(np.isfinite(surface), surface, -1.0).astype(np.float32), np.ones((3, 3)))
-        total += _in_deviations(spread, covered)
+        known = np.where(np.isfinite(surface), surface, np.float32(-1.0))
+        total += _in_deviations(np.asarray(cv2.dilate(known, np.ones((3, 3))), np.float32), covered)
     return _in_deviations(total, covered) if len(surfaces) > 1 else total, covered
 
 
