@@ -1,6 +1,8 @@
 """Bring a pair's DEM onto the reference over stable terrain: one shift, then an affine transformation per tile."""
 
 import logging
+import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,10 +10,14 @@ from cosp.dem.coregistration import coregister as coregister_model
 from cosp.dem.coregistration import describe, match_tiles, whole_shift
 from cosp.dem.terrain import slope_deg, stable_terrain
 from cosp.errors import NoOverlapError
+from cosp.geometry.grids import PixelGrid
 from cosp.geometry.statistics import summarise
+from cosp.imaging.windows import Window
 from cosp.io import rasters, records, vectors
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
+
+CELLS_AT_ONCE = 30_000_000  # 72 bytes each are needed to match them
 
 
 def coregister(
@@ -34,11 +40,15 @@ def coregister(
     cells_per_independent,
     seed,
     threads,
+    cells_at_once=CELLS_AT_ONCE,
 ):
     log = logging.getLogger("coregister")
     info = rasters.info(dem_path)
-    grid, crs = info.grid, info.crs
-    heights_m = rasters.read(dem_path)
+    crs = info.crs
+    # A large model is matched by every so-manyth of its cells, and moved whole, strip by strip.
+    factor = max(1, math.ceil(math.sqrt(math.prod(info.shape) / cells_at_once)))
+    heights_m = thinned(dem_path, factor)
+    grid = PixelGrid(info.grid.x0, info.grid.y0, factor * info.grid.step_x, factor * info.grid.step_y, heights_m.shape)
     reference_m = ellipsoidal_heights(reference_dem_path, grid, crs, reference_dem_heights)
     if not np.isfinite(heights_m - reference_m).any():
         raise NoOverlapError(f"{dem_path} and {reference_dem_path} have no ground in common")
@@ -75,8 +85,14 @@ def coregister(
         threads=threads,
     )
     log.info("%d tiles, %d of them by an affine transformation", len(found), sum(t.method == "affine" for t in found))
-    moved_m = coregister_model(heights_m, found, grid, overlap_m=overlap_km * 1000)
-    rasters.write(coregistered_path, moved_m, grid=grid, crs=crs, descriptions=["height_m"], tags=info.tags, cog=True)
+    before_m = summarise((heights_m - reference_m)[stable])
+    stable_cells = int((stable & np.isfinite(heights_m)).sum()) * factor**2
+    heights_m = None  # the whole one takes its place
+    scaled = [replace(tile, window=scaled_window(tile.window, factor, info.shape)) for tile in found]
+    moved_m = coregister_model(rasters.read(dem_path), scaled, info.grid, overlap_m=overlap_km * 1000)
+    rasters.write(
+        coregistered_path, moved_m, grid=info.grid, crs=crs, descriptions=["height_m"], tags=info.tags, cog=True
+    )
     records.write(
         summary_path,
         {
@@ -84,11 +100,29 @@ def coregister(
             "version": 1,
             "shift_m": shift_m,
             "shift_method": method,
-            "stable_cells": int((stable & np.isfinite(heights_m)).sum()),
-            "before_m": summarise((heights_m - reference_m)[stable]),
-            "after_m": summarise((moved_m - reference_m)[stable]),
+            "stable_cells": stable_cells,
+            "before_m": before_m,
+            "after_m": summarise((moved_m[::factor, ::factor] - reference_m)[stable]),
             "tiles": [describe(tile, grid) for tile in found],
         },
+    )
+
+
+def thinned(path, factor):
+    """Every so-manyth row and column of a raster's first band, read by strips."""
+    rows, columns = rasters.info(path).shape
+    height = factor * 512
+    strips = [Window(row, min(row + height, rows), 0, columns) for row in range(0, rows, height)]
+    return np.concatenate([rasters.read(path, window=strip)[::factor, ::factor] for strip in strips])
+
+
+def scaled_window(window, factor, shape):
+    """A window of thinned cells in the cells of the whole."""
+    return Window(
+        window.row0 * factor,
+        min(window.row1 * factor, shape[0]),
+        window.column0 * factor,
+        min(window.column1 * factor, shape[1]),
     )
 
 

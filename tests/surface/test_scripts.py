@@ -33,6 +33,20 @@ GRIDDING = {
     "point_sigma_px": 0.1,
     "points_per_independent": 1.0,
 }
+COREGISTRATION = {
+    "reference_dem_heights": "ellipsoidal",
+    "slope_limit_deg": 40.0,
+    "outlier_m": 150.0,
+    "least_cells": 2000,
+    "most_cells": 100_000,
+    "tile_km": 20.0,
+    "overlap_km": 4.0,
+    "least_share": 0.3,
+    "sigma_matrix": 5e-4,
+    "sigma_shift_m": 20.0,
+    "cells_per_independent": 9.0,
+    "seed": 1,
+}
 SHIFT_M = np.array([60.0, -35.0, 12.0])  # of the reference against the truth
 
 
@@ -142,18 +156,7 @@ def site(tmp_path_factory):
         None,
         folder / "dem_coregistered.tif",
         folder / "coregistration.json",
-        reference_dem_heights="ellipsoidal",
-        slope_limit_deg=40.0,
-        outlier_m=150.0,
-        least_cells=2000,
-        most_cells=100_000,
-        tile_km=20.0,
-        overlap_km=4.0,
-        least_share=0.3,
-        sigma_matrix=5e-4,
-        sigma_shift_m=20.0,
-        cells_per_independent=9.0,
-        seed=1,
+        **COREGISTRATION,
         threads=2,
     )
     function("assess_dem")(
@@ -256,6 +259,27 @@ def test_coregistration_finds_how_the_reference_lies(site):
     assert found["shift_method"] == "nuth_kaab"
     assert_allclose(found["shift_m"], SHIFT_M, atol=4)
     assert found["after_m"]["nmad"] < 0.6 * found["before_m"]["nmad"]
+
+
+def test_a_large_model_is_matched_by_some_of_its_cells_and_moved_whole(site):
+    size = np.prod(rasters.info(site / "dem.tif").shape)
+    function("coregister")(
+        site / "dem.tif",
+        site / "reference.tif",
+        None,
+        site / "dem_coregistered_thinned.tif",
+        site / "coregistration_thinned.json",
+        **COREGISTRATION,
+        threads=1,
+        cells_at_once=size // 3,
+    )
+    found = records.read_json(site / "coregistration_thinned.json")
+    assert found["shift_method"] == "nuth_kaab"
+    assert_allclose(found["shift_m"], SHIFT_M, atol=6)
+    assert rasters.info(site / "dem_coregistered_thinned.tif").grid == rasters.info(site / "dem.tif").grid
+    moved, expected = (rasters.read(site / f"dem_coregistered{name}.tif") for name in ("_thinned", ""))
+    assert np.isfinite(moved).sum() > 0.99 * np.isfinite(expected).sum()
+    assert np.nanmedian(np.abs(moved - expected)) < 1.0
 
 
 def test_quality_tells_before_and_after_and_against_the_independent_model(site):
