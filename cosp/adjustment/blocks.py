@@ -24,6 +24,7 @@ from cosp.adjustment.observations import (
 )
 from cosp.adjustment.posterior import place_sigma_m
 from cosp.adjustment.robust import Resection, resect
+from cosp.adjustment.solver import END_SIGMA
 from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import NotEnoughMatchesError
@@ -33,6 +34,7 @@ PointsT = TypeVar("PointsT", Control, Ties)
 
 # The single images are oriented by then: wide enough for what tie points still move.
 SECOND_START_SIGMA = 30.0
+TIES_AT_FIRST = 4000  # of a pair, to begin with
 
 
 @dataclass(frozen=True)
@@ -166,18 +168,27 @@ def orient_block(
         information=information,
     )
     means = [replace(camera, scan_direction=found.scan_direction) for camera, found in zip(cameras, start, strict=True)]
+    held = [_held(points, alone, None if held_out is None else held_out[n]) for n, points in enumerate(ties)]
+    options: dict[str, Any] = {
+        "priors": PLAIN_PRIORS,
+        "gate_sigma": gate_sigma,
+        "prior_cameras": means,
+        "information": information if alone.any() else None,
+        "reference": reference,
+    }
+    # Far from the solution a part of the tie points does as well as all.
+    parts = [slice(None, None, math.ceil(len(points) / TIES_AT_FIRST) or 1) for points in ties]
+    thinned = [_part(points, part) for points, part in zip(tie_allowed, parts, strict=True)]
     plain = adjust(
         start,
         allowed,
-        tie_allowed,
-        priors=PLAIN_PRIORS,
-        gate_sigma=gate_sigma,
-        prior_cameras=means,
+        thinned,
         start_sigma=SECOND_START_SIGMA,
-        information=information if alone.any() else None,
-        reference=reference,
-        to_reference=[_held(points, alone, None if held_out is None else held_out[n]) for n, points in enumerate(ties)],
+        to_reference=[chosen[part] for chosen, part in zip(held, parts, strict=True)],
+        **options,
     )
+    if sum(map(len, thinned)) < sum(map(len, ties)):
+        plain = adjust(plain.cameras, allowed, tie_allowed, start_sigma=END_SIGMA, to_reference=held, **options)
     if field is None:
         return OrientedBlock(plain, tuple(resections), None, plain)
     calibration = calibrate(
@@ -246,6 +257,13 @@ def with_checks(
         learned=block.calibration,
     )
     return replace(block, adjustment=_with_fields(calibration), calibration=calibration)
+
+
+def _part(points: Ties, part: slice) -> Ties:
+    """Some of the tie points."""
+    return replace(
+        points, first_mm=points.first_mm[part], second_mm=points.second_mm[part], sigma_mm=points.sigma_mm[part]
+    )
 
 
 def _held(points: Ties, alone: BoolArray, held_out: BoolArray | None) -> BoolArray:

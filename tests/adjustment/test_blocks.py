@@ -58,6 +58,17 @@ def test_tie_points_weighted_as_the_film_deserves_do_not_hurt():
     assert together < 1.1 * alone
 
 
+def test_a_beginning_with_part_of_the_tie_points_ends_where_all_would(monkeypatch):
+    simulated = simulate_pair(np.random.default_rng(5), gcps=200, ties=900)
+    cameras = oriented(simulated).adjustment.cameras
+    monkeypatch.setattr(blocks, "TIES_AT_FIRST", 100)
+    begun = oriented(simulated).adjustment
+    assert [len(weights) for weights in begun.tie_weights] == [900]
+    for camera, other in zip(cameras, begun.cameras, strict=True):
+        film = np.array([[-300.0, 20.0], [0.0, 0.0], [300.0, -20.0]])
+        np.testing.assert_allclose(camera.project(other.locate(film, 1500.0)), film, atol=0.02 * PIXEL_MM)
+
+
 def test_compensation_is_read_from_the_parameters():
     fore, aft = simulate_pair(np.random.default_rng(0), gcps=10, ties=10).cameras
     assert precision.compensation_of(fore).kind == precision.compensation_of(aft).kind == "nodding"

@@ -1,6 +1,6 @@
 """Plain model against film fields, from noisy observations of a pair with known truth: the table of docs/adjustment.md.
 
-    python -m tests.benchmarks.adjustment [--seeds 1 2 3] [case ...]
+    python -m tests.benchmarks.adjustment [case ...] [--seeds 1 2 3]
     python -m tests.benchmarks.adjustment --block 12 [--ties 20000] [--without-control 3]
 
 Of several seeds, medians are printed, and the worst of the heights. --block adjusts so many successive pairs at once
