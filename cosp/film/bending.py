@@ -8,7 +8,6 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
-from scipy.ndimage import binary_closing, binary_dilation
 
 from cosp.arrays import ByteArray, FloatArray
 from cosp.film.exposure import Exposure
@@ -24,11 +23,6 @@ _DISTANCE_DEGREE = 2
 _WEIGHT_OF_TREND = 0.01
 _LARGEST_OPENING_MM = 0.25
 _LEAST_GATE_MM = 0.05
-_JUMP = 6.0  # standard deviations of a trace's noise
-_LEAST_JUMP_MM = 0.001
-_STRETCH_MM = 15.0  # between two jumps of one disturbance
-_MARGIN_MM = 4.0
-_MOST_DISTURBED = 0.3
 
 
 @dataclass(frozen=True)
@@ -165,7 +159,7 @@ def bending_from_traces(
     single_sd_mm : float
         Standard deviation of the missing curve where there is one line only.
     """
-    traces = [_undisturbed(trace) if source == "stripes" else trace for trace in (top, bottom) if trace is not None]
+    traces = [trace for trace in (top, bottom) if trace is not None]
     low = min(float(trace.x_mm[0]) for trace in traces)
     high = max(float(trace.x_mm[-1]) for trace in traces)
     x = np.linspace(low, high, max(2, round((high - low) / step_mm) + 1))
@@ -192,24 +186,6 @@ def bending_from_traces(
         y_top_mm=mean_top - offset,
         y_bottom_mm=mean_bottom - offset,
     )
-
-
-def _undisturbed(trace: Trace) -> Trace:
-    """The trace without the stretches where it jumps: there a scratch or a mark runs along the line and draws it aside.
-
-    Such a stretch is bridged far better than it is followed.
-    """
-    y = trace.y_mm
-    bend = np.abs(y[1:-1] - (y[:-2] + y[2:]) / 2)
-    jumps = np.zeros(len(y), bool)
-    jumps[1:-1] = bend > max(_JUMP * trace.noise_mm, _LEAST_JUMP_MM)
-    spacing = float(trace.x_mm[1] - trace.x_mm[0])
-    closing, margin = (np.ones(2 * round(mm / spacing / 2) + 1, bool) for mm in (_STRETCH_MM, _MARGIN_MM))
-    padded = np.pad(jumps, len(closing))
-    disturbed = binary_dilation(binary_closing(padded, closing), margin)[len(closing) : -len(closing)]
-    if disturbed.mean() > _MOST_DISTURBED:  # a rough line, not a disturbed one
-        return trace
-    return replace(trace, y_mm=np.where(disturbed, np.nan, y))
 
 
 def _distance_smooth(distance: Trace, smoothing_mm: float) -> tuple[Callable[[FloatArray], FloatArray], float]:
