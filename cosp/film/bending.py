@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
+from scipy.ndimage import binary_closing, binary_dilation
 
 from cosp.arrays import ByteArray, FloatArray
 from cosp.film.exposure import Exposure
@@ -23,6 +24,11 @@ _DISTANCE_DEGREE = 2
 _WEIGHT_OF_TREND = 0.01
 _LARGEST_OPENING_MM = 0.25
 _LEAST_GATE_MM = 0.05
+_JUMP = 6.0  # standard deviations of the traces' noise
+_LEAST_JUMP_MM = 0.001
+_STRETCH_MM = 15.0  # between two jumps of one disturbance
+_MARGIN_MM = 4.0
+_MOST_DISTURBED = 0.3
 
 
 @dataclass(frozen=True)
@@ -159,6 +165,8 @@ def bending_from_traces(
     single_sd_mm : float
         Standard deviation of the missing curve where there is one line only.
     """
+    if source == "stripes" and top is not None and bottom is not None:
+        top, bottom = _undisturbed(top, bottom), _undisturbed(bottom, top)
     traces = [trace for trace in (top, bottom) if trace is not None]
     low = min(float(trace.x_mm[0]) for trace in traces)
     high = max(float(trace.x_mm[-1]) for trace in traces)
@@ -186,6 +194,28 @@ def bending_from_traces(
         y_top_mm=mean_top - offset,
         y_bottom_mm=mean_bottom - offset,
     )
+
+
+def _undisturbed(trace: Trace, other: Trace) -> Trace:
+    """The trace without the stretches where it jumps and the other one does not.
+
+    There a scratch or a mark runs along the line and draws it aside; bridging such a stretch is far better than
+    following it. A step of the scanner moves both lines alike.
+    """
+
+    def bends(y: FloatArray) -> FloatArray:
+        inner = np.abs(y[1:-1] - (y[:-2] + y[2:]) / 2)
+        return np.pad(inner, 1, constant_values=np.nan)
+
+    least = max(_JUMP * float(np.hypot(trace.noise_mm, other.noise_mm)), _LEAST_JUMP_MM)
+    jumps = (bends(trace.y_mm - other.y_mm) > least) & (bends(trace.y_mm) > bends(other.y_mm))
+    spacing = float(trace.x_mm[1] - trace.x_mm[0])
+    closing, margin = (np.ones(2 * round(mm / spacing / 2) + 1, bool) for mm in (_STRETCH_MM, _MARGIN_MM))
+    padded = np.pad(jumps, len(closing))
+    disturbed = binary_dilation(binary_closing(padded, closing), margin)[len(closing) : -len(closing)]
+    if disturbed.mean() > _MOST_DISTURBED:  # a rough line, not a disturbed one
+        return trace
+    return replace(trace, y_mm=np.where(disturbed, np.nan, trace.y_mm))
 
 
 def _distance_smooth(distance: Trace, smoothing_mm: float) -> tuple[Callable[[FloatArray], FloatArray], float]:
