@@ -28,7 +28,7 @@ from cosp.imaging.windows import Window, tiles
 
 _log = logging.getLogger(__name__)
 
-TILE_PX = 2048
+TILE_PX = 1792
 HALO_PX = 48
 """What a tile sees of its neighbours."""
 

@@ -17,7 +17,7 @@ References: [Hirschmuller2008] for the paths, [Zabih1994] for the census.
 """
 
 # Compiled code has types of its own.
-# mypy: disable-error-code="no-untyped-call,call-arg,arg-type,assignment,unreachable,var-annotated"
+# mypy: disable-error-code="no-untyped-call,call-arg,arg-type,assignment,unreachable,var-annotated,no-any-return"
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
