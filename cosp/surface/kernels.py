@@ -272,7 +272,8 @@ def _median_of_known(values: FloatArray, row: int, column: int, around: FloatArr
                 count += 1
     if count == 0:
         return np.nan
-    return 0.5 * (around[(count - 1) // 2] + around[count // 2])
+    middle: float = 0.5 * (around[(count - 1) // 2] + around[count // 2])
+    return middle
 
 
 @njit(nogil=True, cache=True)
