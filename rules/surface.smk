@@ -29,7 +29,9 @@ rule match_dense:
 
 rule merge_disparity:
     input:
-        disparity=gather.match_dense("results/pairs/{{pair}}/disparity/{scatteritem}.tif"),
+        disparity=gather.match_dense(
+            "results/pairs/{{pair}}/disparity/{scatteritem}.tif"
+        ),
         validity=gather.match_dense("results/pairs/{{pair}}/validity/{scatteritem}.tif"),
     output:
         disparity="results/pairs/{pair}/disparity.tif",
