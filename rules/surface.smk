@@ -119,6 +119,7 @@ rule grid_dem:
         crs=crs_of_site,
         resolution_m=of_site("dem_resolution_m"),
         ray_spacing_mm=choices("triangulate")["ray_spacing_mm"],
+        ray_error_px=choices("triangulate")["ray_error_px"],
         pair=lambda wildcards: wildcards.pair,
         fore=member("fore"),
         aft=member("aft"),

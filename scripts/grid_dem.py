@@ -39,6 +39,7 @@ def grid_dem(
     crs,
     resolution_m,
     ray_spacing_mm,
+    ray_error_px,
     kernel_cells,
     gate_sigmas,
     least_confidence,
@@ -53,11 +54,12 @@ def grid_dem(
     aft = records.read(aft_camera_path, PanoramicCamera).moved_to(fore.origin)
     pixels = PixelIntersection.prepare(
         rectification,
-        fore.rays,
-        aft.rays,
+        fore.rays_about_format,
+        aft.rays_about_format,
         rasters.read(y_parallax_path, band=SMOOTH_BAND),
         rasters.info(y_parallax_path).grid,
         spacing_px=ray_spacing_mm / rectification.pixel_mm,
+        largest_error_rad=ray_error_px * rectification.pixel_mm / fore.focal_length_mm,
     )
     summary = records.read_json(summary_path)
     frame = records.from_plain(summary["origin"], LocalFrame, f"{summary_path}: origin")
@@ -159,6 +161,7 @@ if __name__ == "__main__":
             crs=snakemake.params.crs,
             resolution_m=snakemake.params.resolution_m,
             ray_spacing_mm=snakemake.params.ray_spacing_mm,
+            ray_error_px=snakemake.params.ray_error_px,
             kernel_cells=snakemake.params.kernel_cells,
             gate_sigmas=snakemake.params.gate_sigmas,
             least_confidence=snakemake.params.least_confidence,

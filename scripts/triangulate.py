@@ -29,6 +29,7 @@ def triangulate(
     summary_path,
     *,
     ray_spacing_mm,
+    ray_error_px,
     gate_sigmas,
     gate_px,
     threads,
@@ -39,11 +40,12 @@ def triangulate(
     aft = records.read(aft_camera_path, PanoramicCamera).moved_to(fore.origin)
     pixels = PixelIntersection.prepare(
         rectification,
-        fore.rays,
-        aft.rays,
+        fore.rays_about_format,
+        aft.rays_about_format,
         rasters.read(y_parallax_path, band=SMOOTH_BAND),
         rasters.info(y_parallax_path).grid,
         spacing_px=ray_spacing_mm / rectification.pixel_mm,
+        largest_error_rad=ray_error_px * rectification.pixel_mm / fore.focal_length_mm,
     )
     disparity_info = rasters.info(disparity_path)
 
@@ -135,6 +137,7 @@ if __name__ == "__main__":
             gap_path=snakemake.output.ray_gap,
             summary_path=snakemake.output.summary,
             ray_spacing_mm=snakemake.params.ray_spacing_mm,
+            ray_error_px=snakemake.params.ray_error_px,
             gate_sigmas=snakemake.params.gate_sigmas,
             gate_px=snakemake.params.gate_px,
             threads=snakemake.threads,

@@ -18,6 +18,7 @@ from cosp.geometry.rays import Rays
 from cosp.geometry.rotations import angles_from_matrix, rotation_matrix
 
 Triple = tuple[float, float, float]
+_BEYOND_FORMAT_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,16 @@ class PanoramicCamera:
         direction = (rotation * in_camera[..., :, None]).sum(-2)
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
         return Rays(p[0:3] + tau * p[3:6], direction)
+
+    def rays_about_format(self, film_mm: FloatArray) -> Rays:
+        """Rays as of `rays`, NaN for points more than a millimetre outside the format.
+
+        Rectified images have corners that are far from any film; what the rays of such places are is arbitrary.
+        """
+        film_mm = np.asarray(film_mm, dtype=float)
+        format_mm = np.array([self.half_length_mm, self.half_width_mm])
+        near = (np.abs(film_mm) <= format_mm + _BEYOND_FORMAT_MM).all(axis=-1)
+        return self.rays(np.where(near[..., None], film_mm, np.nan))
 
     def locate(self, film_mm: FloatArray, height_m: FloatArray | float) -> FloatArray:
         """Ground points (..., 3), local frame, where rays reach an ellipsoidal height.

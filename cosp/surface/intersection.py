@@ -16,7 +16,6 @@ from cosp.imaging.windows import Window
 from cosp.surface import kernels
 from cosp.surface.nodes import between_nodes
 
-_LARGEST_ERROR_RAD = 2e-7  # a fiftieth of the pixel of a film digitised at 7 um
 _CHECKED_EVERY = 8  # cells along, at which a table is held against rays between its nodes
 _BLOCK_NODES = 20_000  # nodes whose rays are asked for at a time
 
@@ -52,7 +51,7 @@ def nodes_over(low: tuple[float, float], high: tuple[float, float], *, spacing_p
     return PixelGrid(low[0], low[1], steps[0], steps[1], (counts[1], counts[0]))
 
 
-def tabulate_rays(rays: Callable[[FloatArray], Rays], nodes: PixelGrid) -> RayTable:
+def tabulate_rays(rays: Callable[[FloatArray], Rays], nodes: PixelGrid, *, largest_error_rad: float) -> RayTable:
     """Table of the rays of one camera, whatever camera.
 
     Parameters
@@ -62,6 +61,8 @@ def tabulate_rays(rays: Callable[[FloatArray], Rays], nodes: PixelGrid) -> RayTa
     nodes : PixelGrid
         Bilinear between them. 0.3 mm of film apart they leave less than a millimetre on the ground
         where the film is without distortion.
+    largest_error_rad : float
+        Angle between a ray and what the nodes about it say that is let pass.
 
     Raises
     ------
@@ -80,7 +81,7 @@ def tabulate_rays(rays: Callable[[FloatArray], Rays], nodes: PixelGrid) -> RayTa
         node = np.concatenate([sampled.origin, sampled.direction / (sampled.direction @ middle)], axis=-1)
         values[:, row : row + part.shape[0]] = np.moveaxis(node, -1, 0)
         worst = max(worst, _error_between(rays, part, node[..., 3:]))
-    if not worst < _LARGEST_ERROR_RAD:
+    if not worst < largest_error_rad:
         raise ValueError(
             f"rays bend by {worst:.1e} rad between {rows} x {columns} nodes of the image: no such table holds them"
         )
@@ -186,6 +187,7 @@ class PixelIntersection:
         y_parallax_nodes: PixelGrid,
         *,
         spacing_px: float,
+        largest_error_rad: float,
     ) -> PixelIntersection:
         """Tabulate the rays of both films over their rectified images.
 
@@ -193,11 +195,13 @@ class PixelIntersection:
         ----------
         pair : RectifiedPair
         fore_rays, aft_rays : functions
-            Rays of film points (..., 2) in mm, in one local frame.
+            Rays of film points (..., 2) in mm, in one local frame; NaN outside the film.
         y_parallax, y_parallax_nodes
             As of the class; NaN is taken as none.
         spacing_px : float
             Largest distance of nodes.
+        largest_error_rad : float
+            See `tabulate_rays`.
         """
         rows, columns = pair.shape
         y_parallax = np.nan_to_num(y_parallax)
@@ -207,10 +211,15 @@ class PixelIntersection:
         centres = nodes.centres()
         lowest, highest = pair.disparity_bounds(centres[..., 1], centres[..., 0])
         return cls(
-            tabulate_rays(lambda place: fore_rays(pair.fore_film(place[..., 1], place[..., 0])), nodes),
+            tabulate_rays(
+                lambda place: fore_rays(pair.fore_film(place[..., 1], place[..., 0])),
+                nodes,
+                largest_error_rad=largest_error_rad,
+            ),
             tabulate_rays(
                 lambda place: aft_rays(pair.aft_film(place[..., 1], place[..., 0])),
                 nodes_over((low - 1, -slack), (columns + high, rows - 1 + slack), spacing_px=spacing_px),
+                largest_error_rad=largest_error_rad,
             ),
             lowest,
             highest,

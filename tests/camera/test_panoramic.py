@@ -75,6 +75,15 @@ def test_a_point_behind_the_camera_or_beyond_the_sweep_is_nan():
     assert np.isnan(tested.project([300e3, 0.0, 0.0])).all()
 
 
+def test_rays_about_the_format_are_those_of_the_film_and_none_far_from_it(film_mm):
+    tested = camera()
+    near = tested.rays_about_format(film_mm)
+    assert_allclose(near.direction, tested.rays(film_mm).direction)
+    assert_allclose(near.origin, tested.rays(film_mm).origin)
+    beyond = [[tested.half_length_mm + 1.1, 0.0], [0.0, -tested.half_width_mm - 1.1]]
+    assert np.isnan(tested.rays_about_format(beyond).direction).all()
+
+
 def test_turning_the_film_changes_the_sign_of_both_coordinates(film_mm):
     tested = camera(imc_factor=0.0145)
     ground = tested.locate(film_mm, 800.0)

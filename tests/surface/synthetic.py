@@ -48,6 +48,7 @@ def texture(easting, northing):
 
 
 PIXEL_MM = 0.007
+LARGEST_ERROR_RAD = 2e-7  # a fiftieth of that pixel
 
 
 def film_of(place):
@@ -58,7 +59,7 @@ def film_of(place):
 def ray_table(seen_by, *, rows=(-52_000, 52_000), columns=(-4200, 4200), spacing_px=42.0) -> RayTable:
     """Rays of a camera over such an image of its film."""
     nodes = nodes_over((columns[0], rows[0]), (columns[1], rows[1]), spacing_px=spacing_px)
-    return tabulate_rays(lambda place: seen_by.rays(film_of(place)), nodes)
+    return tabulate_rays(lambda place: seen_by.rays(film_of(place)), nodes, largest_error_rad=LARGEST_ERROR_RAD)
 
 
 def conjugate_pixels(fore, aft, window: Window, height_m):

@@ -20,7 +20,7 @@ from cosp.surface.intersection import (
     pixel_on_ground,
     tabulate_rays,
 )
-from tests.surface.synthetic import PIXEL_MM, camera, conjugate_pixels, film_of, ray_table
+from tests.surface.synthetic import LARGEST_ERROR_RAD, PIXEL_MM, camera, conjugate_pixels, film_of, ray_table
 
 # Two rows each from all over a film, wide enough for more pixels than are intersected side by side, and not a multiple.
 WINDOWS = [Window(row, row + 2, -4000, 4001) for row in (-51_000, -30_011, -9_000, -1, 7, 20_333, 44_000, 50_990)]
@@ -112,7 +112,11 @@ def test_a_table_is_refused_for_rays_that_bend_between_its_nodes(pair):
         return pair[0].rays(film_mm + 1e-2 * np.stack([np.zeros(film_mm.shape[:-1]), film_mm[..., 1] ** 2], axis=-1))
 
     with pytest.raises(ValueError, match="bend by"):
-        tabulate_rays(bent, nodes_over((-4000, -500), (4000, 500), spacing_px=50.0))
+        tabulate_rays(
+            bent,
+            nodes_over((-4000, -500), (4000, 500), spacing_px=50.0),
+            largest_error_rad=LARGEST_ERROR_RAD,
+        )
 
 
 def test_a_table_takes_any_camera_whose_rays_are_smooth():
@@ -122,9 +126,11 @@ def test_a_table_takes_any_camera_whose_rays_are_smooth():
         return Rays(np.broadcast_to([0.0, 0.0, 5000.0], direction.shape), direction)
 
     nodes = nodes_over((-100, -100), (100, 100), spacing_px=0.4)
-    table = tabulate_rays(frame_camera, nodes)
+    table = tabulate_rays(frame_camera, nodes, largest_error_rad=LARGEST_ERROR_RAD)
     moved = tabulate_rays(
-        lambda film: Rays(frame_camera(film).origin + [2000.0, 0, 0], frame_camera(film).direction), nodes
+        lambda film: Rays(frame_camera(film).origin + [2000.0, 0, 0], frame_camera(film).direction),
+        nodes,
+        largest_error_rad=LARGEST_ERROR_RAD,
     )
     place = np.array([30.0, 18.0])  # of the ground at 500, 300, 0 m: 300 mm over 5000 m
     aft = -300.0 * (np.array([500.0, 300.0]) - [2000, 0]) / -5000.0
@@ -182,7 +188,12 @@ def test_a_prepared_pair_leaves_out_disparities_of_ground_that_cannot_be(pair):
     middle = float(np.median(y_parallax))
     nodes = nodes_over((0, 0), (499, 299), spacing_px=50.0)
     pixels = PixelIntersection.prepare(
-        Plain(), *(c.rays for c in pair), np.full(nodes.shape, middle), nodes, spacing_px=50.0
+        Plain(),
+        *(c.rays for c in pair),
+        np.full(nodes.shape, middle),
+        nodes,
+        spacing_px=50.0,
+        largest_error_rad=LARGEST_ERROR_RAD,
     )
     found, miss_m = pixels.ground(window, disparity.astype(np.float32))
     unlikely = height_m > 2000

@@ -27,6 +27,7 @@ from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 from cosp.surface.gridding import grid_points
 from cosp.surface.intersection import PixelIntersection
+from tests.surface.synthetic import LARGEST_ERROR_RAD
 
 GEOID_M = 50.4  # of EGM96 near Mont Ventoux above the ellipsoid
 _log = logging.getLogger(__name__)
@@ -161,7 +162,9 @@ def points_of_pair(fore, aft, heights_m):
     found = match(*images, rectification.disparity_range_px, y_parallax=field, **DENSE)
     # Here nothing but the correction of the rows is said about y-parallax.
     none = np.zeros(nodes.shape, np.float32)
-    pixels = PixelIntersection.prepare(rectification, fore.rays, aft.rays, none, nodes, spacing_px=8.0)
+    pixels = PixelIntersection.prepare(
+        rectification, fore.rays, aft.rays, none, nodes, spacing_px=8.0, largest_error_rad=LARGEST_ERROR_RAD
+    )
     ground, gap_m = pixels.ground(whole, found.disparity)
     return ground, gap_m, before.summary(), after.summary()
 
