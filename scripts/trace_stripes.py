@@ -9,7 +9,7 @@ import pandas as pd
 from cosp.camera.missions import WIDTH_MM, mission_for
 from cosp.errors import InputError
 from cosp.film.arrangement import laid
-from cosp.film.exposure import find_exposure
+from cosp.film.exposure import find_exposure, inverted
 from cosp.film.joining import Layout, compose_reduced
 from cosp.film.rail_holes import find_rail_holes
 from cosp.film.stripes import band_profiles, smooth_base, trace_edge, trace_ridge
@@ -68,6 +68,11 @@ def trace_stripes(
         )
     except InputError as problem:
         raise InputError(f"{', '.join(map(str, part_paths))}: {problem}") from problem
+    if exposure.negative:
+        log.warning("the picture is darker than the film beside it: a negative")
+        parts = [inverted(part) for part in parts]
+    if max(exposure.edges_found) == 0:
+        log.warning("no film is seen beside the picture: its centre is taken to be that of the scan")
     records.write(exposure_path, exposure)
     log.info("%s", exposure)
 

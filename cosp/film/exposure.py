@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -36,7 +37,9 @@ class Exposure:
     ends_found : (left, right)
         Whether the end of the format is seen; an end that is not is taken from the other end and the nominal length.
     edges_found : (top, bottom)
-        Share of the length over which each long edge is seen.
+        Share of the length over which each long edge is seen; none where the scan was cut to the format.
+    negative : bool
+        Whether the picture is darker than the bare film beside it.
     """
 
     KIND: ClassVar[str] = "exposure"
@@ -50,6 +53,7 @@ class Exposure:
     centre_sd_mm: tuple[float, float]
     ends_found: tuple[bool, bool]
     edges_found: tuple[float, float]
+    negative: bool = False
 
     def pixels(self, xy_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows and columns in the joined film of points (..., 2) of the film, mm, x to the right and y up."""
@@ -76,6 +80,12 @@ _FAINT_SIGNIFICANCE = 6.0
 _LEAST_FAINT_GREY = 0.02
 _THIRD = 1.0 / 3.0
 _BARE_MM = 5.0  # of film beyond the format at least
+_CUT_MM = 0.5  # how closely a scan that was cut to the format was cut
+
+
+def inverted(image: ByteArray) -> ByteArray:
+    """Grey values of a negative turned into those of a positive; 0, where there is no film, stays."""
+    return np.where(image > 0, np.maximum(255 - image, 1), 0).astype(np.uint8)
 
 
 def find_exposure(
@@ -94,7 +104,8 @@ def find_exposure(
     A side of the format is a straight line along which the picture is brighter than the film beside it. Lines are
     found as pairs at the nominal distance from each other, which leaves out the edges of the film, the scanner's
     border, marks and titling; where the picture is as dark as the film (night, sea) the rest of the line and the other
-    side of the pair carry it.
+    side of the pair carry it. A film that fits such lines clearly better with light and dark exchanged is a negative.
+    A scan that is no wider than the format was cut to it: its middle is the centre.
 
     Parameters
     ----------
@@ -118,16 +129,33 @@ def find_exposure(
     """
     step_mm = pixel_mm * factor
     valid = image > 0 if valid is None else valid
-    # Thin bright lines beside the picture (stripes, scratches) would look like its edge: an opening takes them away.
-    across = _steps(without_lines(image, step_mm), valid, axis=0)
-    tilt, top, bottom = _long_sides(across, step_mm, width_mm, width_tolerance, length_mm, pixel_mm)
-    top_line, top_share, top_sd = _fit_line(across, tilt, top, reach=1.5 / step_mm)
-    bottom_line, bottom_share, bottom_sd = _fit_line(-across, tilt, bottom, reach=1.5 / step_mm)
-    if max(top_share, bottom_share) < 0.1:
+    negative = False
+    top_share = bottom_share = 0.0
+    scanned_mm = image.shape[0] * step_mm
+    if scanned_mm < width_mm * (1 - width_tolerance):
         raise InputError(
-            f"the long sides of the format are seen over {100 * top_share:.0f} % and {100 * bottom_share:.0f} % of the "
-            "film; a tenth of one of them is needed"
+            f"with pixels of {1000 * pixel_mm:g} um the film is {scanned_mm:.1f} mm wide; the format alone has "
+            f"{width_mm:.1f} mm: is pixel_um right?"
         )
+    if scanned_mm > width_mm:
+        # Thin bright lines beside the picture (stripes, scratches) would look like its edge: an opening takes them out.
+        positive, other = (_steps(without_lines(grey, step_mm), valid, axis=0) for grey in (image, inverted(image)))
+        choices = (step_mm, width_mm, width_tolerance, length_mm)
+        found, reverse = _long_sides(positive, *choices), _long_sides(other, *choices)
+        negative = reverse.strength > _CLEARLY * max(found.strength, reverse.elsewhere)
+        across, sides = (other, reverse) if negative else (positive, found)
+        if sides.elsewhere > _CLEARLY * sides.strength:
+            raise _wrong_scale(pixel_mm, sides.elsewhere_px * step_mm, width_mm)
+        image = inverted(image) if negative else image
+        top_line, top_share, top_sd = _fit_line(across, sides.slope, sides.top, reach=1.5 / step_mm)
+        bottom_line, bottom_share, bottom_sd = _fit_line(-across, sides.slope, sides.bottom, reach=1.5 / step_mm)
+    if max(top_share, bottom_share) < 0.1:
+        if scanned_mm > width_mm * (1 + width_tolerance):
+            raise InputError(
+                f"the long sides of the format are seen over {100 * top_share:.0f} % and {100 * bottom_share:.0f} % of "
+                "the film; a tenth of one of them is needed"
+            )
+        return _cut_to_format(image, pixel_mm, factor, length_mm, width_mm, length_tolerance)
     # Columns refer to the middle of the image; rows = line[0] + line[1] (column - middle).
     middle = (image.shape[1] - 1) / 2
     slope = float(np.average([top_line[1], bottom_line[1]], weights=[top_share + 0.01, bottom_share + 0.01]))
@@ -152,6 +180,32 @@ def find_exposure(
         centre_sd_mm=(float(end_sd * step_mm), float(np.hypot(top_sd, bottom_sd) / 2 * step_mm)),
         ends_found=ends,
         edges_found=(top_share, bottom_share),
+        negative=negative,
+    )
+
+
+def _cut_to_format(
+    image: ByteArray, pixel_mm: float, factor: int, length_mm: float, width_mm: float, length_tolerance: float
+) -> Exposure:
+    """The exposed area of a scan without the film beside the picture: the scan itself, or its ends where they show."""
+    step_mm = pixel_mm * factor
+    rows, columns = image.shape
+    scanned_mm = columns * step_mm
+    if scanned_mm > length_mm * (1 + length_tolerance):
+        left, right, ends, end_sd = _short_sides(image, image > 0, step_mm, length_mm, length_tolerance)
+    else:
+        left, right, ends = -0.5, columns - 0.5, (False, False)
+        end_sd = np.hypot(_CUT_MM, (length_mm - scanned_mm) / math.sqrt(12)) / step_mm
+    sd_across_mm = float(np.hypot(_CUT_MM, (width_mm - rows * step_mm) / math.sqrt(12)))
+    return Exposure(
+        pixel_mm=pixel_mm,
+        centre_px=(float(((left + right) / 2 + 0.5) * factor - 0.5), (rows * factor - 1) / 2),
+        tilt_deg=0.0,
+        half_length_mm=float((right - left) / 2 * step_mm),
+        half_width_mm=min(rows * step_mm, width_mm) / 2,
+        centre_sd_mm=(float(end_sd * step_mm), sd_across_mm),
+        ends_found=ends,
+        edges_found=(0.0, 0.0),
     )
 
 
@@ -172,10 +226,23 @@ def _steps(image: ByteArray, valid: BoolArray, *, axis: int) -> Float32Array:
     return np.asarray(np.moveaxis(np.clip(np.where(seen, step, 0.0), -_FULL_STEP, _FULL_STEP), 0, axis))
 
 
-def _long_sides(
-    across: Float32Array, step_mm: float, width_mm: float, tolerance: float, length_mm: float, pixel_mm: float
-) -> tuple[float, float, float]:
-    """Slope and the rows (at the middle column) of the two lines that look most like the long sides."""
+@dataclass(frozen=True)
+class _Sides:
+    """The two lines that look most like the long sides: slope, rows at the middle column; how much they look like it.
+
+    `elsewhere` is the same of the best lines at another distance than the nominal one, `elsewhere_px`.
+    """
+
+    strength: float
+    slope: float
+    top: float
+    bottom: float
+    elsewhere: float
+    elsewhere_px: int
+
+
+def _long_sides(across: Float32Array, step_mm: float, width_mm: float, tolerance: float, length_mm: float) -> _Sides:
+    """The two lines that look most like the long sides, in steps of grey across the film."""
     rows, columns = across.shape
     block = max(1, round(5.0 / step_mm))
     count = columns // block
@@ -187,6 +254,7 @@ def _long_sides(
     limit = np.tan(np.radians(_TILT_LIMIT_DEG))
     low, high = (int(width_mm * (1 + sign * tolerance) / step_mm) for sign in (-1, 1))
     least, most = int(low * (1 - _WRONG_SCALE)), min(int(high * (1 + _WRONG_SCALE)), rows - 1)
+    high = min(high, rows - 1)
     for slope in np.arange(-limit, limit, 0.5 * step_mm / (length_mm / 2)):
         shift = np.rint(slope * x).astype(int)
         source = np.arange(rows)[:, None] + shift
@@ -202,10 +270,8 @@ def _long_sides(
             height = float((profile[: rows - distance] - profile[distance:]).max())
             if height > other[0]:
                 other = (height, distance)
-    if other[0] > _CLEARLY * best[0]:
-        raise _wrong_scale(pixel_mm, other[1] * step_mm, width_mm)
     # The step at index i lies between rows i and i + 1.
-    return best[1], best[2] + 0.5, best[3] + 0.5
+    return _Sides(best[0], best[1], best[2] + 0.5, best[3] + 0.5, *other)
 
 
 def _wrong_scale(pixel_mm: float, found_mm: float, width_mm: float) -> InputError:

@@ -118,6 +118,33 @@ def test_a_wrong_size_of_pixels_is_asked_about(film, wrong):
         find_exposure(block_mean(film.image, 2), pixel_mm=film.pixel_mm * wrong, factor=2, **FORMAT)
 
 
+def test_a_negative_is_known_for_one_and_measured_alike(film):
+    positive = _found(film)
+    negative = _found(film, np.where(film.image > 0, 255 - film.image, 0).astype(np.uint8))
+    assert not positive.negative
+    assert negative.negative
+    assert_allclose(negative.centre_px, positive.centre_px, atol=0.5)
+    assert_allclose(negative.half_width_mm, positive.half_width_mm, atol=0.02)
+
+
+def test_a_scan_cut_to_the_format_has_its_centre_in_the_middle():
+    film = make_film(np.random.default_rng(7), pixel_mm=0.14, tilt_deg=0.0, bent=False)
+    column, row = film.centre
+    half = [round(side / 2 / film.pixel_mm) for side in (WIDTH_MM - 0.6, LENGTH_MM - 0.6)]
+    cut = film.image[round(row) - half[0] : round(row) + half[0], round(column) - half[1] : round(column) + half[1]]
+    found = _found(film, cut)
+    assert found.edges_found == (0.0, 0.0)
+    assert found.ends_found == (False, False)
+    assert_allclose(found.centre_px, [half[1] - 0.5, half[0] - 0.5], atol=3.0)
+    assert 0.1 < found.centre_sd_mm[1] < 1.0
+    assert 2 * found.half_width_mm <= WIDTH_MM
+
+
+def test_a_scan_narrower_than_the_format_is_refused(film):
+    with pytest.raises(InputError, match="the format alone has"):
+        _found(film, film.image[: round(0.8 * WIDTH_MM / film.pixel_mm)])
+
+
 def test_a_film_without_a_format_is_refused():
     noise = np.random.default_rng(0).integers(18, 26, (280, 2900)).astype(np.uint8)
     with pytest.raises(InputError, match="long sides of the format"):
