@@ -28,6 +28,8 @@ ITERATIONS = 12
 LEARNING_ITERATIONS = 3  # after these the prior and the scales stay, so that the rest can settle
 SETTLED = 1e-2  # rms movement of the observations, in standard deviations
 HUBER_SIGMA = 2.0
+# By iteration, how many times the gate heights of the reference may be off: far from all control they start far off.
+WIDE_GATES = {1: 12.0, 2: 4.0}
 BELIEF_IN_SIGMAS = 20.0  # observations' worth of belief that the given sigmas are right
 SCALE_LIMITS = (0.05, 5.0)
 CELL_MM = 10.0  # of film; errors of points within one may be alike
@@ -207,7 +209,8 @@ def calibrate(
         near = going_on or iteration > 0
         early = height_weights is not None and any(weight.any() for weight in height_weights)
         rows = _linearise(now, control, ties, reference if near or early else None, held_out)
-        weights = [_weights(group, scales, gate_sigma) for group in rows]
+        wide = 1.0 if going_on else WIDE_GATES.get(iteration, 1.0)
+        weights = [_weights(group, scales, gate_sigma * (wide if group.kind == "dem" else 1.0)) for group in rows]
         if not near and control_weights is not None and tie_weights is not None:
             weights = [*control_weights, *tie_weights, *(height_weights or ())][: len(rows)]
         groups = [_Normal.of(group, weight, now) for group, weight in zip(rows, weights, strict=True)]

@@ -139,6 +139,19 @@ def test_nothing_runs_away_where_there_is_no_control():
     assert error[inside].max() < 3.0 * error[~inside].max()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [21, 22])
+def test_heights_far_off_far_from_control_are_drawn_to_the_reference(seed):
+    """Coarse films, a pixel of which is worth sixty metres of height, with control in their middle third alone."""
+    simulated = simulate_pair(
+        np.random.default_rng(seed), gcps=120, ties=2000, distortion_px=20.0, pixel_mm=16 * PIXEL_MM
+    )
+    control = [part_of(points, np.abs(points.film_mm[:, 0]) < HALF_LENGTH_MM / 3) for points in simulated.control]
+    found = calibrated(replace(simulated, control=control))
+    assert simulated.model_errors_m(found.plain.cameras)[2] > 100.0
+    assert simulated.model_errors_m(found.adjustment.cameras)[2] < 10.0
+
+
 def part_of(points, chosen):
     return replace(points, **{name: getattr(points, name)[chosen] for name in points.__dataclass_fields__})
 
