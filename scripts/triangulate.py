@@ -37,15 +37,14 @@ def triangulate(
     log = logging.getLogger("triangulate")
     rectification = records.read(rectification_path, Rectification)
     fore = records.read(fore_camera_path, PanoramicCamera)
-    aft = records.read(aft_camera_path, PanoramicCamera).moved_to(fore.origin)
-    pixels = PixelIntersection.prepare(
+    pixels = PixelIntersection.of_films(
         rectification,
-        fore.rays_about_format,
-        aft.rays_about_format,
+        fore,
+        records.read(aft_camera_path, PanoramicCamera),
         rasters.read(y_parallax_path, band=SMOOTH_BAND),
         rasters.info(y_parallax_path).grid,
-        spacing_px=ray_spacing_mm / rectification.pixel_mm,
-        largest_error_rad=ray_error_px * rectification.pixel_mm / fore.focal_length_mm,
+        ray_spacing_mm=ray_spacing_mm,
+        ray_error_px=ray_error_px,
     )
     disparity_info = rasters.info(disparity_path)
 

@@ -169,8 +169,8 @@ class PanoramicCamera:
         """
         film_mm = np.asarray(film_mm, dtype=float)
         format_mm = np.array([self.half_length_mm, self.half_width_mm])
-        near = (np.abs(film_mm) <= format_mm + _BEYOND_FORMAT_MM).all(axis=-1)
-        return self.rays(np.where(near[..., None], film_mm, np.nan))
+        near = np.all(np.abs(film_mm) <= format_mm + _BEYOND_FORMAT_MM, axis=-1, keepdims=True)
+        return self.rays(np.where(near, film_mm, np.nan))
 
     def locate(self, film_mm: FloatArray, height_m: FloatArray | float) -> FloatArray:
         """Ground points (..., 3), local frame, where rays reach an ellipsoidal height.

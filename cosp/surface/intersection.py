@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from cosp.arrays import Float32Array, FloatArray
+from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.rays import Rays
 from cosp.imaging.windows import Window
@@ -142,6 +143,10 @@ class RectifiedPair(Protocol):
         """Rows and columns of the fore image."""
 
     @property
+    def pixel_mm(self) -> float:
+        """Size of a pixel of both images on the film."""
+
+    @property
     def disparity_range_px(self) -> tuple[float, float]:
         """Lowest and highest disparity of all pixels."""
 
@@ -176,6 +181,41 @@ class PixelIntersection:
     highest: FloatArray
     y_parallax: FloatArray
     y_parallax_nodes: PixelGrid
+
+    @classmethod
+    def of_films(
+        cls,
+        pair: RectifiedPair,
+        fore: PanoramicCamera,
+        aft: PanoramicCamera,
+        y_parallax: FloatArray,
+        y_parallax_nodes: PixelGrid,
+        *,
+        ray_spacing_mm: float,
+        ray_error_px: float,
+    ) -> PixelIntersection:
+        """The same as `prepare` for two panoramic cameras, in the local frame of the fore one.
+
+        Parameters
+        ----------
+        pair : RectifiedPair
+        fore, aft : PanoramicCamera
+        y_parallax, y_parallax_nodes
+            As of the class; NaN is taken as none.
+        ray_spacing_mm : float
+            Largest distance of nodes on the film.
+        ray_error_px : float
+            How far off rays between the nodes may be.
+        """
+        return cls.prepare(
+            pair,
+            fore.rays_about_format,
+            aft.moved_to(fore.origin).rays_about_format,
+            y_parallax,
+            y_parallax_nodes,
+            spacing_px=ray_spacing_mm / pair.pixel_mm,
+            largest_error_rad=ray_error_px * pair.pixel_mm / fore.focal_length_mm,
+        )
 
     @classmethod
     def prepare(
