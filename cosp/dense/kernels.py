@@ -708,7 +708,7 @@ def select(
     fatal = np.uint8(~tolerated & 0xFF)
     zero, one = np.float32(0), np.float32(1)
     fractions = np.empty(columns, np.float32)
-    befores, afters = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    values_before, values_after = np.empty(columns, np.float32), np.empty(columns, np.float32)
     others, theirs = np.empty(columns, np.uint8), np.empty(columns, np.uint8)
     # Many loops without jumps and with few arrays, so that all but those that look up become vector code.
     for row in range(rows):
@@ -729,8 +729,8 @@ def select(
         line = prior[row]
         for column in range(columns):
             start = np.uint64(column + shift + np.int64(chosen[column])) - np.uint64(fractions[column] < zero)
-            befores[column] = line[start]
-            afters[column] = line[start + np.uint64(1)]
+            values_before[column] = line[start]
+            values_after[column] = line[start + np.uint64(1)]
         line = right_winners[row]
         for column in range(columns):
             others[column] = line[np.uint64(column + np.int64(chosen[column]))]
@@ -750,13 +750,15 @@ def select(
             fraction = fractions[column]
             weight = fraction + (one if fraction < zero else zero)
             coarse = np.float32(np.int32(chosen[column]) - half)
-            given[column] = coarse + fraction + befores[column] + weight * (afters[column] - befores[column])
+            given[column] = (
+                coarse + fraction + values_before[column] + weight * (values_after[column] - values_before[column])
+            )
         if whole:
-            befores[:] = prior[row, margin : margin + columns]
+            values_before[:] = prior[row, margin : margin + columns]
         else:
-            befores[:] = np.nan
+            values_before[:] = np.nan
         for column in range(columns):
-            given[column] = given[column] if ours[column] & fatal == 0 else befores[column]
+            given[column] = given[column] if ours[column] & fatal == 0 else values_before[column]
 
 
 # --- what pictures and disparity maps decide alone -------------------------------------------------------------------

@@ -414,7 +414,7 @@ class PlacedFilm:
             margin_px=margin_px,
             threads=threads,
         )
-        log.info("%d matches in %d tiles of %d px at %.1f m", len(matches), len(tiles_mm), tile_px, self.posting_m)
+        log.info("%d matches in %d tiles of %s px at %.1f m", len(matches), len(tiles_mm), tile_px, self.posting_m)
         return matches
 
 
