@@ -23,7 +23,7 @@ from cosp.adjustment.observations import (
     place_information,
 )
 from cosp.adjustment.posterior import place_sigma_m
-from cosp.adjustment.robust import Resection, resect
+from cosp.adjustment.robust import Resection, resect_control
 from cosp.adjustment.solver import END_SIGMA
 from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
@@ -140,16 +140,11 @@ def orient_block(
         )
     allowed = [_allowing(points, film_distortion_mm) for points in control]
     resections = [
-        resect(
+        resect_control(
             camera,
-            points.film_mm,
-            points.ground_m,
-            sigma_px=points.sigma_mm,
-            pixel_mm=1.0,
+            points,
             priors=PLAIN_PRIORS,
             gate_sigma=gate_sigma,
-            sigma_ground_m=points.sigma_ground_m,
-            sigma_height_m=points.sigma_height_m,
         )
         if len(points) >= CONTROL_NEEDED
         else None

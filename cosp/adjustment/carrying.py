@@ -9,7 +9,7 @@ import numpy as np
 
 from cosp.adjustment.bundle import CONTROL_NEEDED
 from cosp.adjustment.observations import Control, HeightReference, Priors, Ties
-from cosp.adjustment.robust import Resection, resect
+from cosp.adjustment.robust import Resection, resect_control
 from cosp.arrays import FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import NotEnoughMatchesError
@@ -66,16 +66,11 @@ def carry(
                 "that have"
             )
         mine = slice(13 * best, 13 * (best + 1))
-        found = resect(
+        found = resect_control(
             cameras[best],
-            points.film_mm,
-            points.ground_m,
-            sigma_px=points.sigma_mm,
-            pixel_mm=1.0,
+            points,
             priors=priors,
             gate_sigma=gate_sigma,
-            sigma_ground_m=points.sigma_ground_m,
-            sigma_height_m=points.sigma_height_m,
             directions=_directions(cameras[best], list(oriented.values())),
             information=information[mine, mine],
         )

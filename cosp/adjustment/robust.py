@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -102,6 +102,29 @@ def resect(
         sigma_ground_m=np.broadcast_to(np.asarray(sigma_ground_m, float), count),
         sigma_height_m=np.broadcast_to(np.asarray(sigma_height_m, float), count),
     )
+    found = resect_control(
+        camera,
+        control,
+        priors=priors,
+        gate_sigma=gate_sigma,
+        directions=directions,
+        start_sigma=start_sigma,
+        information=information,
+    )
+    return replace(found, residuals_px=found.residuals_px / pixel_mm)
+
+
+def resect_control(
+    camera: PanoramicCamera,
+    control: Control,
+    *,
+    priors: Priors,
+    gate_sigma: float,
+    directions: Sequence[int] = DIRECTIONS,
+    start_sigma: float = START_SIGMA,
+    information: FloatArray | None = None,
+) -> Resection:
+    """The same as `resect` for points that are control already: a pixel is a millimetre, in the residuals too."""
     tried = [
         adjust(
             [camera.with_parameters(camera.parameters(), scan_direction=direction)],
@@ -120,7 +143,7 @@ def resect(
     return Resection(
         camera=found,
         weights=best.control_weights[0],
-        residuals_px=(film_mm - found.project(control.ground_m)) / pixel_mm,
+        residuals_px=control.film_mm - found.project(control.ground_m),
         sigma0=best.sigma_naught,
         scan_direction=found.scan_direction,
         other_direction_cost=tried[1].cost - best.cost if len(tried) > 1 else float("nan"),
