@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from cosp.arrays import ByteArray
 from cosp.camera.field import FilmField
 from cosp.geometry.grids import PixelGrid
@@ -17,9 +15,7 @@ _KERNEL_PX = 4  # that cubic interpolation reaches, and some for rounding
 
 def measured_window(field: FilmField, grid: PixelGrid, window: Window) -> Window:
     """Window of the measured image that a window of the ideal one is made from, both on one grid."""
-    # Splines never exceed their largest coefficient.
-    largest_mm = float(np.abs(field.coefficients).max())
-    return window.grown(_KERNEL_PX + math.ceil(largest_mm / abs(grid.step_x)), grid.shape)
+    return window.grown(_KERNEL_PX + math.ceil(field.largest_mm / abs(grid.step_x)), grid.shape)
 
 
 def without_field(field: FilmField, grid: PixelGrid, window: Window, measured: ByteArray) -> ByteArray:

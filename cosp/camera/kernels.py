@@ -91,8 +91,29 @@ def _weights(x: float, half: float, knot: float, intervals: int, cubic: bool) ->
 
 
 @njit(nogil=True, cache=True, inline="always")
+def _piece(joints: FloatArray, width: float, x: float) -> tuple[int, float, float]:
+    """Piece of film at x, how far it has passed into the next one, 0 to 1, and how fast it does, per mm."""
+    p = 0
+    while p < joints.shape[0] and x >= joints[p] + 0.5 * width:
+        p += 1
+    if p < joints.shape[0] and x > joints[p] - 0.5 * width:
+        u = (x - joints[p]) / width + 0.5
+        return p, u * u * u * (u * (6.0 * u - 15.0) + 10.0), 30.0 * (u * (1.0 - u)) ** 2 / width
+    return p, 0.0, 0.0
+
+
+@njit(nogil=True, cache=True, inline="always")
 def _displacement(
-    table: FloatArray, half_x: float, half_y: float, knot_x: float, knot_y: float, x: float, y: float
+    table: FloatArray,
+    half_x: float,
+    half_y: float,
+    knot_x: float,
+    knot_y: float,
+    joints: FloatArray,
+    width: float,
+    offsets: FloatArray,
+    x: float,
+    y: float,
 ) -> tuple[float, float]:
     i, a0, a1, a2, a3 = _weights(x, half_x, knot_x, table.shape[0] - 3, True)
     j, b0, b1, b2, _ = _weights(y, half_y, knot_y, table.shape[1] - 2, False)
@@ -103,29 +124,73 @@ def _displacement(
         row = table[i + k]
         dx += a * (b0 * row[j, 0] + b1 * row[j + 1, 0] + b2 * row[j + 2, 0])
         dy += a * (b0 * row[j, 1] + b1 * row[j + 1, 1] + b2 * row[j + 2, 1])
+    if joints.shape[0] > 0:
+        p, t, _ = _piece(joints, width, x)
+        v = min(max((y + half_y) / (2.0 * half_y), 0.0), 1.0)
+        here = offsets[p]
+        following = offsets[min(p + 1, joints.shape[0])]
+        dx += (1.0 - t) * ((1.0 - v) * here[0, 0] + v * here[1, 0])
+        dy += (1.0 - t) * ((1.0 - v) * here[0, 1] + v * here[1, 1])
+        dx += t * ((1.0 - v) * following[0, 0] + v * following[1, 0])
+        dy += t * ((1.0 - v) * following[0, 1] + v * following[1, 1])
     return dx, dy
 
 
 @njit(nogil=True, cache=True)
-def distort(table: FloatArray, half_x: float, half_y: float, knot_x: float, knot_y: float, film_mm: FloatArray) -> None:
-    """Add the displacement of a film field to film points (N, 2), in place; NaN stays."""
+def distort(
+    table: FloatArray,
+    half_x: float,
+    half_y: float,
+    knot_x: float,
+    knot_y: float,
+    joints: FloatArray,
+    width: float,
+    offsets: FloatArray,
+    film_mm: FloatArray,
+) -> None:
+    """Add the displacement of a film field to film points (N, 2), in place; NaN stays.
+
+    Parameters
+    ----------
+    table : (along, across, 2) array
+        Coefficients of the splines.
+    half_x, half_y, knot_x, knot_y : float
+        Half the film that they cover, and the distance of their knots.
+    joints : (J,) array
+        Where pieces of film meet, rising.
+    width : float
+        Over which one piece passes into the next.
+    offsets : (J + 1, 2, 2) array
+        Of each piece at the lower and the upper edge of the film, the component last.
+    film_mm : (N, 2) array
+    """
     for n in range(film_mm.shape[0]):
         x, y = film_mm[n, 0], film_mm[n, 1]
         if x == x and y == y:
-            dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, x, y)
+            dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, joints, width, offsets, x, y)
             film_mm[n, 0] = x + dx
             film_mm[n, 1] = y + dy
 
 
 @njit(nogil=True, cache=True)
-def correct(table: FloatArray, half_x: float, half_y: float, knot_x: float, knot_y: float, film_mm: FloatArray) -> None:
+def correct(
+    table: FloatArray,
+    half_x: float,
+    half_y: float,
+    knot_x: float,
+    knot_y: float,
+    joints: FloatArray,
+    width: float,
+    offsets: FloatArray,
+    film_mm: FloatArray,
+) -> None:
     """Undo `distort`, in place: a fixed point that gains three digits a step, for the field changes slowly."""
     for n in range(film_mm.shape[0]):
         measured_x, measured_y = film_mm[n, 0], film_mm[n, 1]
         if measured_x == measured_x and measured_y == measured_y:
             x, y = measured_x, measured_y
             for _ in range(8):
-                dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, x, y)
+                dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, joints, width, offsets, x, y)
                 change = abs(measured_x - dx - x) + abs(measured_y - dy - y)
                 x = measured_x - dx
                 y = measured_y - dy
@@ -143,11 +208,16 @@ def splines_at(
     half_y: float,
     knot_x: float,
     knot_y: float,
+    joints: FloatArray,
+    width: float,
     film_mm: FloatArray,
     splines: IntArray,
     values: FloatArray,
 ) -> None:
-    """Numbers (N, 12) and values (N, 12) of the splines that are not zero at film points (N, 2)."""
+    """Numbers and values (N, 12) of the splines that are not zero at film points (N, 2); (N, 16) with joints.
+
+    The last four are the two edges of a piece of film and of the next one, counted after the splines.
+    """
     for n in range(film_mm.shape[0]):
         x, y = film_mm[n, 0], film_mm[n, 1]
         if not (x == x and y == y):
@@ -161,6 +231,16 @@ def splines_at(
             for m in range(3):
                 splines[n, 3 * k + m] = (i + k) * across + j + m
                 values[n, 3 * k + m] = a * (b0 if m == 0 else b1 if m == 1 else b2)
+        if joints.shape[0] > 0:
+            p, t, _ = _piece(joints, width, x)
+            v = min(max((y + half_y) / (2.0 * half_y), 0.0), 1.0)
+            for k in range(2):
+                piece = min(p + k, joints.shape[0])
+                share = t if k == 1 else 1.0 - t
+                splines[n, 12 + 2 * k] = along * across + 2 * piece
+                splines[n, 13 + 2 * k] = along * across + 2 * piece + 1
+                values[n, 12 + 2 * k] = share * (1.0 - v)
+                values[n, 13 + 2 * k] = share * v
 
 
 @njit(nogil=True, cache=True)
@@ -170,6 +250,9 @@ def field_gradient(
     half_y: float,
     knot_x: float,
     knot_y: float,
+    joints: FloatArray,
+    width: float,
+    offsets: FloatArray,
     film_mm: FloatArray,
     gradient: FloatArray,
 ) -> None:
@@ -206,3 +289,15 @@ def field_gradient(
                 by_y += a * (db[0] * row[j, c] + db[1] * row[j + 1, c] + db[2] * row[j + 2, c])
             gradient[n, c, 0] = by_x * scale_x
             gradient[n, c, 1] = by_y * scale_y
+        if joints.shape[0] > 0:
+            p, t, slope = _piece(joints, width, x)
+            share = min(max((y + half_y) / (2.0 * half_y), 0.0), 1.0)
+            across = 1.0 / (2.0 * half_y) if abs(y) <= half_y else 0.0
+            here = offsets[p]
+            following = offsets[min(p + 1, joints.shape[0])]
+            for c in range(2):
+                change_0 = following[0, c] - here[0, c]
+                change_1 = following[1, c] - here[1, c]
+                gradient[n, c, 0] += slope * ((1.0 - share) * change_0 + share * change_1)
+                gradient[n, c, 1] += across * ((1.0 - t) * (here[1, c] - here[0, c]))
+                gradient[n, c, 1] += across * (t * (following[1, c] - following[0, c]))

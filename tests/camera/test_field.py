@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
 from cosp.camera.derivatives import PARAMETER_NAMES, film_derivatives
-from cosp.camera.field import FilmField
+from cosp.camera.field import FilmField, FilmSteps
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.frames import LocalFrame
 from cosp.io import records
@@ -26,9 +26,20 @@ def rough_field(rng, size_mm=0.02):
     return flat.with_coefficients(rng.normal(0.0, size_mm, (*flat.shape, 2)))
 
 
+def with_steps(field, rng, size_mm=0.01):
+    """The field of a film whose pieces were set down by hundredths of a millimetre off."""
+    steps = FilmSteps.none_at((-180.0, 3.0, 170.0), width_mm=3.0)
+    return replace(field, steps=steps.with_offsets(rng.normal(0.0, size_mm, (4, 2, 2))))
+
+
 @pytest.fixture
-def field():
+def smooth():
     return rough_field(np.random.default_rng(1))
+
+
+@pytest.fixture(params=["smooth", "stepped"])
+def field(smooth, request):
+    return smooth if request.param == "smooth" else with_steps(smooth, np.random.default_rng(4))
 
 
 @pytest.fixture
@@ -38,7 +49,8 @@ def film_mm():
     )
 
 
-def test_the_splines_are_those_of_scipy(field, film_mm):
+def test_the_splines_are_those_of_scipy(smooth, film_mm):
+    field = smooth
     along, across = (2 * half / n for half, n in zip((HALF_LENGTH_MM, HALF_WIDTH_MM), field.intervals, strict=True))
     knots_x = along * np.arange(-3, field.intervals[0] + 4) - HALF_LENGTH_MM
     knots_y = across * np.arange(-2, field.intervals[1] + 3) - HALF_WIDTH_MM
@@ -51,7 +63,37 @@ def test_the_splines_are_those_of_scipy(field, film_mm):
     assert_allclose((values[..., None] * field.coefficients.reshape(-1, 2)[splines]).sum(1), expected, atol=1e-15)
 
 
-def test_splines_are_centred_where_they_say(field):
+def test_pieces_are_off_by_their_offsets_and_pass_into_each_other(smooth, film_mm):
+    stepped = with_steps(smooth, np.random.default_rng(4))
+    steps = stepped.steps
+
+    def off(film):
+        return stepped.displacement(film) - smooth.displacement(film)
+
+    middle, lower = (np.array([[-181.5, y], [-178.5, y], [169.0, y]]) for y in (0.0, -HALF_WIDTH_MM))
+    u = (169.0 - 170.0) / 3.0 + 0.5
+    t = u**3 * (6.0 * u**2 - 15.0 * u + 10.0)
+    for film, offsets in ((lower, steps.offsets[:, 0]), (middle, steps.offsets.mean(axis=1))):
+        expected = [offsets[0], offsets[1], (1.0 - t) * offsets[2] + t * offsets[3]]
+        assert_allclose(off(film), expected, atol=1e-13)
+    # Beyond the edges across and the ends along they keep their values.
+    assert_allclose(off(np.array([[400.0, -40.0]])), [steps.offsets[3, 0]], atol=1e-13)
+    functions, values = stepped.basis(film_mm)
+    assert functions.max() < stepped.functions == len(stepped.amounts)
+    assert_allclose((values[..., None] * stepped.amounts[functions]).sum(1), stepped.displacement(film_mm), atol=1e-13)
+    assert stepped.with_amounts(stepped.amounts) == stepped
+    assert np.abs(stepped.displacement(film_mm)).max() < stepped.largest_mm
+
+
+def test_joints_nearer_than_their_passage_and_offsets_of_another_number_are_refused():
+    with pytest.raises(ValueError, match="for a transition of 3"):
+        FilmSteps.none_at((10.0, 12.0), width_mm=3.0)
+    with pytest.raises(ValueError, match="4 offsets for 2 pieces"):
+        FilmSteps((0.0,), 3.0, (0.0,) * 4)
+
+
+def test_splines_are_centred_where_they_say(smooth):
+    field = smooth
     x, y = field.centres_mm()
     # A spline surface whose coefficients lie on a plane is that plane.
     plane = field.with_coefficients(np.stack(np.meshgrid(0.01 * x, 0.02 * y, indexing="ij"), axis=-1))
