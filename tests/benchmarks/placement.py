@@ -4,9 +4,9 @@ python tests/benchmarks/placement.py [trials] [first] [table.tsv]
 
 Whole films are exposed over made-up mountains of two epochs (other sun, snow line, fields and forests). Each trial
 hides a share of the film under clouds, lays it one of four ways round, and predicts it up to 100 km, 10 degrees and
-5 per cent wrong. Ground is usable where it is seen and, if there is nothing but relief to compare with, not flat. A
-film is placed right if its usable ground is; the rest follows from that, and its error is a figure of its own. The
-last posting is the first at which places are checked.
+5 per cent wrong, with the errors of velocity and rates that are expected of a prediction. Ground is usable where it is
+seen and, if there is nothing but relief to compare with, not flat. A film is placed right if its usable ground is; the
+rest follows from that, and its error is a figure of its own. The last posting is the first at which places are checked.
 With a table, trials are added to it, those that it holds are not run again, and the tables of all of them are printed.
 """
 
@@ -41,6 +41,9 @@ PIXEL_MM = 0.3
 # the last level, well within what the next posting searches.
 RIGHT_MM = 1.5
 TRIALS_PER_WORLD = 20
+# How wrong the prediction's velocity (m a scan), rates (radians a scan) and image motion compensation are: the narrow
+# set of docs/conventions.md.
+SHAPE_SIGMA = np.array([0, 0, 0, 80, 50, 30, 0, 0, 0, *np.radians([0.1, 0.5, 0.1]), 0.002])
 # Share of the film that must show usable ground for it to be placed.
 ENOUGH = 0.3
 # Ground is flat where heights within so far differ by less than this standard deviation.
@@ -107,6 +110,8 @@ def trial(number, world, film, camera):
     useful = usable(world, camera, points, ~hidden[rows, columns], relief=number % 5 == 0)
     predicted = turned_about_centre(camera, np.radians(turn_deg), 1 + scale, 1500.0)
     predicted = moved(predicted, shift_m * np.cos(bearing), shift_m * np.sin(bearing))
+    shape = SHAPE_SIGMA * np.random.default_rng([78, number]).standard_normal(13)
+    predicted = predicted.with_parameters(predicted.parameters() + shape)
     start = time.process_time()
     row = {"trial": number, "share": share, "turned": way[0], "mirrored": way[1], "shift_km": shift_m / 1e3,
            "turn_deg": turn_deg, "scale": 100 * scale, "relief": number % 5 == 0,

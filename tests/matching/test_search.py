@@ -10,8 +10,8 @@ from cosp.errors import PlacementError
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.matching.film_image import FilmImage
-from cosp.matching.ground import ground_pixel_m
-from cosp.matching.placement import SearchLimits, locate_film, turned_about_centre
+from cosp.matching.ground import film_lattice, ground_pixel_m
+from cosp.matching.placement import SearchLimits, _placed, locate_film, turned_about_centre
 from cosp.matching.search import Candidate, Found, View, Way, _between, _evidence, _standardised
 
 from .conftest import CRS, FILM_PIXEL_MM, moved, texture
@@ -174,6 +174,31 @@ def test_views_reach_every_heading_and_scale():
     assert len(middles) == 4
     wanted = np.linspace(-10.0, 10.0, 81)
     assert np.abs(wanted[:, None] - middles).min(axis=1).max() <= 2.5
+
+
+def test_an_end_that_shows_nothing_lies_where_the_prediction_says_whatever_an_earlier_fit_made_of_it(
+    camera, world, film
+):
+    pixels = film.read(Window(0, film.grid.shape[0], 0, film.grid.shape[1])).copy()
+    x_mm = film.grid.points(np.zeros(film.grid.shape[1]), np.arange(film.grid.shape[1]))[:, 0]
+    pixels[:, x_mm > 0] = 200
+    bent = camera.parameters()
+    bent[[3, 4, 11]] += [1500.0, 1500.0, np.radians(0.9)]
+    placed = _placed(
+        FilmImage.from_array(pixels, film.grid),
+        camera,
+        camera.with_parameters(bent),
+        film_lattice(camera.half_length_mm, camera.half_width_mm, 12, 1),
+        world.on(world.image),
+        world.on(world.heights),
+        CRS,
+        80.0,
+        np.random.default_rng(0),
+        1,
+    )
+    assert placed.agreeing.sum() > 12
+    assert film_error_px(camera.with_parameters(bent), camera).max() > 5
+    assert film_error_px(placed.camera, camera).max() < 1
 
 
 @pytest.mark.slow
