@@ -160,9 +160,8 @@ def match(
             inside = window.inside(grown).slices
             with workspace() as memory:
                 tile = _cleaned(
-                    last,
-                    grown,
-                    _matched(last, grown, memory, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
+                    last.left[grown.slices],
+                    *_matched(last, grown, memory, least_texture_sd=least_texture_sd, saturated_from=saturated_from),
                     memory,
                     least_correlation=least_correlation,
                     least_uniqueness=least_uniqueness,
@@ -225,7 +224,7 @@ def _coarse_to_fine(
         def keep(window: Window, task: _Task = task, coarse: Float32Array = coarse) -> None:
             grown = window.grown(HALO_PX, coarse.shape)
             with workspace() as memory:
-                coarse[window.slices] = _matched(task, grown, memory).disparity[window.inside(grown).slices]
+                coarse[window.slices] = _matched(task, grown, memory)[0].disparity[window.inside(grown).slices]
 
         _log.info("level %d: %d disparities", step.level, step.disparities)
         # The volume of a tile stays the same.
@@ -287,13 +286,16 @@ def _over_tiles(
 
 def _matched(
     task: _Task, window: Window, memory: Workspace, *, least_texture_sd: float | None = None, saturated_from: int = 256
-) -> DisparityMap:
-    """One pass in one window. Without a least texture only data and consistency are asked for, as a prior needs."""
+) -> tuple[DisparityMap, ByteArray]:
+    """One pass in one window, and the right picture at the matches.
+
+    Without a least texture only data and consistency are asked for, as a prior needs.
+    """
     left = np.ascontiguousarray(task.left[window.slices])
     if not left.any():
         outside = np.full(left.shape, int(Validity.NO_DATA_LEFT), np.uint8)
         nothing = np.zeros_like(left)
-        return DisparityMap(np.full(left.shape, np.nan, np.float32), outside, nothing, nothing)
+        return DisparityMap(np.full(left.shape, np.nan, np.float32), outside, nothing, nothing), nothing
     disparities = task.step.disparities
     margin = disparities // 2 + _SLACK_PX
     wide = Window(window.row0, window.row1, window.column0 - margin, window.column1 + margin)
@@ -332,6 +334,7 @@ def _matched(
     return select_disparities(
         found,
         prior,
+        right,
         left_validity=left_validity,
         right_validity=right_validity,
         tolerated=0 if least_texture_sd is not None else int(Validity.AT_RANGE_EDGE),
@@ -341,9 +344,9 @@ def _matched(
 
 
 def _cleaned(
-    task: _Task,
-    window: Window,
+    left: ByteArray,
     tile: DisparityMap,
+    right: ByteArray,
     memory: Workspace,
     *,
     least_correlation: float,
@@ -351,23 +354,17 @@ def _cleaned(
     largest_speckle_px: int,
     speckle_step_px: float,
 ) -> DisparityMap:
-    """Median of 5 x 5; what is not alike, what does not stand out and islands masked; disparities rounded."""
+    """Median of 5 x 5; what is not alike, what does not stand out and islands masked; disparities rounded.
+
+    right : the right picture at the matches
+    """
     if tile.validity.all():
         return tile
     disparity: Float32Array = memory.array("median", tile.disparity.shape, np.float32)
     cv2.medianBlur(tile.disparity, 5, dst=disparity)
-    right = resample_right(
-        task.right,
-        disparity,
-        window.row0,
-        window.column0,
-        y_parallax=task.y_parallax,
-        level=task.step.level,
-        memory=memory,
-    )
     kernels.clean(
         disparity,
-        correlation(np.ascontiguousarray(task.left[window.slices]), right, memory),
+        correlation(np.ascontiguousarray(left), right, memory),
         uniqueness(tile.confidence),
         least_correlation,
         255 * least_uniqueness,

@@ -47,6 +47,7 @@ UNKNOWN_COST = 65535
 
 _REGISTER = 64  # bytes of the vectors in which paths are carried
 _I8, _I16, _I32, _I64 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64)
+_F32 = ir.FloatType()
 
 
 # --- vector code ------------------------------------------------------------------------------------------------------
@@ -392,6 +393,18 @@ def _census_block(_context: Any, source: Any, source_row: Any, target: Any, targ
     return signature, generate
 
 
+def _gathered(builder: Any, addresses: Any, element: Any) -> Any:
+    """The 32-bit elements at a vector of addresses."""
+    count = addresses.type.count
+    pointers, mask = ir.VectorType(element.as_pointer(), count), ir.VectorType(ir.IntType(1), count)
+    vector = ir.VectorType(element, count)
+    kind = "f32" if element is _F32 else "i32"
+    signature = ir.FunctionType(vector, [pointers, _I32, mask, vector])
+    gather = cgutils.get_or_insert_function(builder.module, signature, f"llvm.masked.gather.v{count}{kind}.v{count}p0")
+    every, empty = ir.Constant(mask, [ir.IntType(1)(1)] * count), ir.Constant(vector, ir.Undefined)
+    return builder.call(gather, [builder.inttoptr(addresses, pointers), _I32(1), every, empty])
+
+
 @intrinsic(prefer_literal=True)
 def _sample_block(_context: Any, source: Any, width: Any, across: Any, down: Any, target: Any) -> Any:
     """SAMPLE_BLOCK pixels between four pixels each, by places in 32nds; all but the width are addresses."""
@@ -405,17 +418,9 @@ def _sample_block(_context: Any, source: Any, width: Any, across: Any, down: Any
         five, parts, low = lanes.constant(5), lanes.constant(32), lanes.constant(255)
         index = builder.add(builder.mul(builder.ashr(y, five), stride), builder.ashr(x, five))
         right, below = builder.and_(x, lanes.constant(31)), builder.and_(y, lanes.constant(31))
-        pointers = ir.VectorType(_I32.as_pointer(), SAMPLE_BLOCK)
-        mask = ir.VectorType(ir.IntType(1), SAMPLE_BLOCK)
-        signature = ir.FunctionType(lanes.type, [pointers, _I32, mask, lanes.type])
-        name = f"llvm.masked.gather.v{SAMPLE_BLOCK}i32.v{SAMPLE_BLOCK}p0"
-        gather = cgutils.get_or_insert_function(builder.module, signature, name)
-        every = ir.Constant(mask, [ir.IntType(1)(1)] * SAMPLE_BLOCK)
         rows = []
         for place in (index, builder.add(index, stride)):
-            addresses = builder.add(far.splat(source), builder.zext(place, far.type))
-            empty = ir.Constant(lanes.type, ir.Undefined)
-            word = builder.call(gather, [builder.inttoptr(addresses, pointers), _I32(1), every, empty])
+            word = _gathered(builder, builder.add(far.splat(source), builder.zext(place, far.type)), _I32)
             one = builder.and_(word, low)
             other = builder.and_(builder.lshr(word, lanes.constant(8)), low)
             rows.append(builder.add(builder.mul(one, parts), builder.mul(right, builder.sub(other, one))))
@@ -423,6 +428,114 @@ def _sample_block(_context: Any, source: Any, width: Any, across: Any, down: Any
         value = builder.add(builder.mul(upper, parts), builder.mul(below, builder.sub(lower, upper)))
         value = builder.lshr(builder.add(value, lanes.constant(512)), lanes.constant(10))
         _Lanes(builder, SAMPLE_BLOCK, 8).store(builder.trunc(value, ir.VectorType(_I8, SAMPLE_BLOCK)), target)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic(prefer_literal=True)
+def _select_block(
+    _context: Any,
+    disparities: Any,
+    winners: Any,
+    costs: Any,
+    right_winners: Any,
+    prior: Any,
+    right: Any,
+    right_flags: Any,
+    inconsistent: Any,
+    at_edge: Any,
+    fatal: Any,
+    whole: Any,
+    disparity: Any,
+    flags: Any,
+    confidence: Any,
+    matched: Any,
+) -> Any:
+    """SAMPLE_BLOCK pixels from winners to disparities; all but the number of disparities and the bytes are addresses.
+
+    Those on the right are of what belongs to the first pixel and the first disparity.
+    """
+    signature = types.void(*([types.int64] * 7), *([types.uint8] * 4), *([types.int64] * 4))
+    count = SAMPLE_BLOCK
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        disparities, winners, costs, right_winners, prior, right, right_flags = arguments[:7]
+        inconsistent, at_edge, fatal, whole, disparity, flags, confidence, matched = arguments[7:]
+        bytes_, lanes, far = _Lanes(builder, count, 8), _Lanes(builder, count, 32), _Lanes(builder, count, 64)
+        floats = ir.VectorType(_F32, count)
+
+        def number(value: float) -> Any:
+            return ir.Constant(floats, [_F32(value)] * count)
+
+        def as_float(values: Any) -> Any:
+            return builder.sitofp(values, floats)
+
+        def where(condition: Any, value: Any) -> Any:
+            return builder.select(condition, value, bytes_.constant(0))
+
+        def bytes_at(address: Any, places: Any) -> Any:
+            # Whole words, aligned, lie on the same page as the byte.
+            addresses = builder.add(far.splat(address), builder.sext(places, far.type))
+            words = _gathered(builder, builder.and_(addresses, far.constant(-4)), _I32)
+            turns = builder.shl(
+                builder.and_(builder.trunc(addresses, lanes.type), lanes.constant(3)), lanes.constant(3)
+            )
+            return builder.and_(builder.lshr(words, turns), lanes.constant(255))
+
+        winner = builder.zext(bytes_.load(winners), lanes.type)
+        place = builder.add(winner, lanes.constant(range(count)))
+        last = lanes.splat(builder.trunc(builder.sub(disparities, _I64(1)), _I32))
+        outermost = builder.or_(
+            builder.icmp_signed("==", winner, lanes.constant(0)), builder.icmp_signed("==", winner, last)
+        )
+        packed = _Lanes(builder, 2 * count, 32).load(costs)
+        low, high = (_permuted(builder, packed, packed, range(first, 2 * count, 2)) for first in (0, 1))
+        sixteen, word = lanes.constant(16), lanes.constant(0xFFFF)
+        best, runner_up = builder.lshr(low, sixteen), builder.lshr(high, sixteen)
+        below = as_float(builder.sub(builder.and_(low, word), best))
+        above = as_float(builder.sub(builder.and_(high, word), best))
+        steeper = builder.select(builder.fcmp_ordered(">", above, below), above, below)
+        steeper = builder.select(builder.fcmp_ordered(">", steeper, number(0)), steeper, number(1))
+        fraction = builder.fdiv(builder.fmul(number(0.5), builder.fsub(below, above)), steeper)
+        fraction = builder.select(outermost, number(0), fraction)
+        share = builder.fmul(number(255), as_float(builder.sub(runner_up, best)))
+        share = builder.fdiv(share, builder.fadd(as_float(runner_up), number(float(np.float32(0.001)))))
+        bytes_.store(builder.trunc(builder.fptosi(share, lanes.type), bytes_.type), confidence)
+
+        up = builder.sext(builder.fcmp_ordered(">=", fraction, number(0.5)), lanes.type)
+        down = builder.sext(builder.fcmp_ordered("<", fraction, number(-0.5)), lanes.type)
+        flag = bytes_at(right_flags, builder.add(builder.sub(place, up), down))
+        flag = builder.or_(bytes_.load(flags), builder.trunc(flag, bytes_.type))
+        apart = builder.add(builder.sub(bytes_at(right_winners, place), winner), lanes.constant(1))
+        disagree = builder.icmp_unsigned(">", apart, lanes.constant(2))
+        flag = builder.or_(flag, where(disagree, bytes_.splat(inconsistent)))
+        flag = builder.or_(flag, where(outermost, bytes_.splat(at_edge)))
+        bytes_.store(flag, flags)
+
+        negative = builder.fcmp_ordered("<", fraction, number(0))
+        start = builder.add(place, builder.sext(negative, lanes.type))
+        weight = builder.fadd(fraction, builder.select(negative, number(1), number(0)))
+        addresses = builder.add(far.splat(prior), builder.shl(builder.sext(start, far.type), far.constant(2)))
+        before = _gathered(builder, addresses, _F32)
+        after = _gathered(builder, builder.add(addresses, far.constant(4)), _F32)
+        half = builder.trunc(builder.lshr(disparities, _I64(1)), _I32)
+        value = builder.fadd(as_float(builder.sub(winner, lanes.splat(half))), fraction)
+        value = builder.fadd(builder.fadd(value, before), builder.fmul(weight, builder.fsub(after, before)))
+        words = _gathered(builder, builder.add(far.splat(right), builder.sext(start, far.type)), _I32)
+        one = as_float(builder.and_(words, lanes.constant(255)))
+        other = as_float(builder.and_(builder.lshr(words, lanes.constant(8)), lanes.constant(255)))
+        grey = builder.fadd(builder.fadd(one, builder.fmul(weight, builder.fsub(other, one))), number(0.5))
+        grey = builder.trunc(builder.fptosi(grey, lanes.type), bytes_.type)
+
+        half = builder.lshr(disparities, _I64(1))
+        known = builder.inttoptr(builder.add(prior, builder.shl(half, _I64(2))), floats.as_pointer())
+        some = builder.icmp_unsigned("!=", whole, _I8(0))
+        otherwise = builder.select(some, builder.load(known, align=4), number(float("nan")))
+        fine = builder.icmp_unsigned("==", builder.and_(flag, bytes_.splat(fatal)), bytes_.constant(0))
+        target = builder.inttoptr(disparity, floats.as_pointer())
+        builder.store(builder.select(fine, value, otherwise), target, align=4)
+        bytes_.store(builder.select(fine, grey, bytes_.load(builder.add(right, half))), matched)
         return context.get_dummy_value()
 
     return signature, generate
@@ -677,12 +790,13 @@ def plain_passes(
 # --- from winners to disparities --------------------------------------------------------------------------------------
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def select(
+@njit(nogil=True, cache=True)
+def select_vector(
     winners: Any,
     costs: Any,
     right_winners: Any,
     prior: Any,
+    right: Any,
     right_flags: Any,
     inconsistent_flag: int,
     edge_flag: int,
@@ -691,74 +805,101 @@ def select(
     disparity: Any,
     flags: Any,
     confidence: Any,
+    matched: Any,
 ) -> None:
-    """Sub-pixel winner, left-right check, flags of the matched right pixel, and the prior put back.
+    """Sub-pixel winner, left-right check, flags and grey value of the matched right pixel, and the prior put back.
 
-    prior and right_flags are wider than the left picture by the same number of columns on both sides. With k the
-    disparity that was left over, d(x) = k + prior(x + k). Between whole disparities the cost is taken to fall and rise
-    with equal slopes, as sums of Hamming distances do; a parabola more than doubles the noise of smooth ground.
-    Where there is a flag beyond the tolerated ones, disparity is NaN or, if `whole`, what was known before.
+    prior, right and right_flags are wider than the left picture, of at least SAMPLE_BLOCK columns, by the same number
+    of columns on both sides, two more than half the disparities or more. With k the disparity that was left over,
+    d(x) = k + prior(x + k). Between whole disparities the cost is taken to fall and rise with equal slopes, as sums of
+    Hamming distances do; a parabola more than doubles the noise of smooth ground. Where there is a flag beyond the
+    tolerated ones, disparity is NaN or, if `whole`, what was known before.
     """
+    rows, columns = winners.shape
+    wide = prior.shape[1]
+    margin = (wide - columns) // 2
+    disparities = right_winners.shape[1] - columns
+    shift = margin - disparities // 2
+    for row in range(rows):
+        column = 0
+        while column < columns:
+            start = min(column, columns - SAMPLE_BLOCK)
+            pixel, beyond = row * columns + start, row * wide + start
+            _select_block(
+                disparities,
+                winners.ctypes.data + pixel,
+                costs.ctypes.data + 8 * pixel,
+                right_winners.ctypes.data + row * right_winners.shape[1] + start,
+                prior.ctypes.data + 4 * (beyond + shift),
+                right.ctypes.data + beyond + shift,
+                right_flags.ctypes.data + beyond + shift,
+                np.uint8(inconsistent_flag),
+                np.uint8(edge_flag),
+                np.uint8(~tolerated & 0xFF),
+                np.uint8(whole),
+                disparity.ctypes.data + 4 * pixel,
+                flags.ctypes.data + pixel,
+                confidence.ctypes.data + pixel,
+                matched.ctypes.data + pixel,
+            )
+            column += SAMPLE_BLOCK
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def select_plain(
+    winners: Any,
+    costs: Any,
+    right_winners: Any,
+    prior: Any,
+    right: Any,
+    right_flags: Any,
+    inconsistent_flag: int,
+    edge_flag: int,
+    tolerated: int,
+    whole: bool,
+    disparity: Any,
+    flags: Any,
+    confidence: Any,
+    matched: Any,
+) -> None:
+    """The same as `select_vector` in plain loops, for pictures and margins of any width."""
     rows, columns = winners.shape
     margin = (prior.shape[1] - columns) // 2
     disparities = right_winners.shape[1] - columns
-    half, last = np.int32(disparities // 2), np.int32(disparities - 1)
     shift = margin - disparities // 2
-    at_edge, inconsistent, none = np.uint8(edge_flag), np.uint8(inconsistent_flag), np.uint8(0)
-    fatal = np.uint8(~tolerated & 0xFF)
-    zero, one = np.float32(0), np.float32(1)
-    fractions = np.empty(columns, np.float32)
-    values_before, values_after = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    others, theirs = np.empty(columns, np.uint8), np.empty(columns, np.uint8)
-    # Many loops without jumps and with few arrays, so that all but those that look up become vector code.
+    half = np.float32(0.5)
     for row in range(rows):
-        chosen, given, ours = winners[row], disparity[row], flags[row]
         for column in range(columns):
-            best = np.int32(costs[row, column, BEST])
-            below = np.float32(np.int32(costs[row, column, BELOW]) - best)
-            above = np.float32(np.int32(costs[row, column, ABOVE]) - best)
+            winner = np.int64(winners[row, column])
+            best, runner_up = np.int64(costs[row, column, BEST]), np.int64(costs[row, column, RUNNER_UP])
+            below = np.float32(np.int64(costs[row, column, BELOW]) - best)
+            above = np.float32(np.int64(costs[row, column, ABOVE]) - best)
+            at_edge = winner == 0 or winner == disparities - 1
             steeper = max(below, above)
-            fractions[column] = np.float32(0.5) * (below - above) / (steeper if steeper > zero else one)
-        for column in range(columns):
-            best, runner_up = np.float32(costs[row, column, BEST]), np.float32(costs[row, column, RUNNER_UP])
-            share = np.float32(255) * (runner_up - best) / (runner_up + np.float32(0.001))
+            fraction = half * (below - above) / (steeper if steeper > 0 else np.float32(1))
+            fraction = np.float32(0) if at_edge else fraction
+            share = np.float32(255) * np.float32(runner_up - best) / (np.float32(runner_up) + np.float32(0.001))
             confidence[row, column] = np.uint8(np.int32(share))
-        for column in range(columns):
-            winner = np.int32(chosen[column])
-            fractions[column] = zero if (winner == 0) | (winner == last) else fractions[column]
-        line = prior[row]
-        for column in range(columns):
-            start = np.uint64(column + shift + np.int64(chosen[column])) - np.uint64(fractions[column] < zero)
-            values_before[column] = line[start]
-            values_after[column] = line[start + np.uint64(1)]
-        line = right_winners[row]
-        for column in range(columns):
-            others[column] = line[np.uint64(column + np.int64(chosen[column]))]
-        line = right_flags[row]
-        half_down, half_up = np.float32(-0.5), np.float32(0.5)
-        for column in range(columns):
-            place = np.uint64(column + shift + np.int64(chosen[column]))
-            up, down = np.uint64(fractions[column] >= half_up), np.uint64(fractions[column] < half_down)
-            theirs[column] = line[place + up - down]
-        for column in range(columns):
-            winner = np.int32(chosen[column])
-            apart = np.int32(others[column]) - winner
-            found = inconsistent if (apart > 1) | (apart < -1) else none
-            found |= at_edge if (winner == 0) | (winner == last) else none
-            ours[column] |= found | theirs[column]
-        for column in range(columns):
-            fraction = fractions[column]
-            weight = fraction + (one if fraction < zero else zero)
-            coarse = np.float32(np.int32(chosen[column]) - half)
-            given[column] = (
-                coarse + fraction + values_before[column] + weight * (values_after[column] - values_before[column])
-            )
-        if whole:
-            values_before[:] = prior[row, margin : margin + columns]
-        else:
-            values_before[:] = np.nan
-        for column in range(columns):
-            given[column] = given[column] if ours[column] & fatal == 0 else values_before[column]
+
+            nearest = column + shift + winner
+            flag = flags[row, column] | right_flags[row, nearest + (fraction >= half) - (fraction < -half)]
+            if abs(np.int64(right_winners[row, column + winner]) - winner) > 1:
+                flag |= np.uint8(inconsistent_flag)
+            if at_edge:
+                flag |= np.uint8(edge_flag)
+            flags[row, column] = flag
+
+            start = nearest - (fraction < 0)
+            weight = fraction + (np.float32(1) if fraction < 0 else np.float32(0))
+            before, after = prior[row, start], prior[row, start + 1]
+            value = np.float32(winner - disparities // 2) + fraction + before + weight * (after - before)
+            one, other = np.float32(right[row, start]), np.float32(right[row, start + 1])
+            grey = np.uint8(np.int32(one + weight * (other - one) + half))
+            if flag & np.uint8(~tolerated & 0xFF) != 0:
+                value = prior[row, column + margin] if whole else np.float32(np.nan)
+                grey = right[row, column + margin]
+            disparity[row, column] = value
+            matched[row, column] = grey
 
 
 # --- what pictures and disparity maps decide alone -------------------------------------------------------------------

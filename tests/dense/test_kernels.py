@@ -117,3 +117,40 @@ def test_doubling_puts_pixels_on_pixels_and_means_between(first):
     )
     expected = 2 * map_coordinates(coarse.astype(float), np.meshgrid(rows, columns, indexing="ij"), order=1)
     assert_allclose(fine, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("whole", "tolerated", "margin"), [(True, 0, 18), (False, 32, 24)])
+def test_the_vector_selection_is_the_plain_one_bit_for_bit(whole, tolerated, margin):
+    rng = np.random.default_rng(8)
+    rows, columns, disparities = 7, 75, 32
+    wide = (rows, columns + 2 * margin)
+    costs = rng.integers(0, 2048, (rows, columns, 4)).astype(np.uint16)
+    costs[..., kernels.BEST] = rng.integers(0, costs.min(axis=-1) + 1)
+    costs[::2, ::3] = costs[::2, ::3, kernels.BEST, None]  # all the same
+    winners = rng.integers(0, disparities, (rows, columns), dtype=np.uint8)
+    right_winners = rng.integers(0, disparities, (rows, columns + disparities), dtype=np.uint8)
+    prior = rng.normal(0, 300, wide).astype(np.float32)
+    right, right_flags = rng.integers(0, 256, wide, dtype=np.uint8), rng.integers(0, 2, wide, dtype=np.uint8)
+    flags = np.where(rng.random((rows, columns)) < 0.2, 8, 0).astype(np.uint8)
+    found = []
+    for select in (kernels.select_vector, kernels.select_plain):
+        disparity, ours = np.empty((rows, columns), np.float32), flags.copy()
+        confidence, matched = (np.empty((rows, columns), np.uint8) for _ in range(2))
+        select(
+            winners, costs, right_winners, prior, right, right_flags,
+            4, 32, tolerated, whole, disparity, ours, confidence, matched,
+        )  # fmt: skip
+        found.append((disparity, ours, confidence, matched))
+    for vector, plain in zip(*found, strict=True):
+        assert_array_equal(vector, plain)
+    disparity, ours, confidence, matched = found[0]
+    assert np.bitwise_or.reduce(ours, axis=None) == 1 | 4 | 8 | 32
+    assert (ours == 0).mean() > 0.02
+    assert np.isnan(disparity).any() != whole
+    assert np.ptp(confidence) > 200
+    at_rest = (costs[..., kernels.BELOW] == costs[..., kernels.ABOVE]) & (ours == 0)
+    row, column = np.nonzero(at_rest)
+    place = margin + column + winners[at_rest] - disparities // 2
+    assert len(row) > 0
+    assert_array_equal(disparity[at_rest], prior[row, place] + (winners[at_rest] - np.float32(disparities // 2)))
+    assert_array_equal(matched[at_rest], right[row, place])
