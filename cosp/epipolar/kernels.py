@@ -30,7 +30,7 @@ def evaluate(coefficients: FloatArray, u: FloatArray, v: FloatArray, values: Flo
 
 
 @njit(nogil=True, cache=True)
-def pixels_to_plane(
+def film_points(
     powers: FloatArray,
     rows: FloatArray,
     columns: FloatArray,
@@ -38,11 +38,9 @@ def pixels_to_plane(
     column_scale: tuple[float, float],
     limit: float,
     affine: FloatArray,
-    outside: float,
-    first: FloatArray,
-    second: FloatArray,
+    film_mm: FloatArray,
 ) -> None:
-    """Places in a plane (film, or pixels of a film raster) of places of a rectified image.
+    """Film points of places of a rectified image.
 
     The inverse polynomial is collected once per whole row into a polynomial in u and its derivative along the row
     coordinate; inside a row that leaves a few multiplications per pixel. What comes out depends on the place alone,
@@ -52,8 +50,8 @@ def pixels_to_plane(
     rows : (H, W), or (H, 1) where a line is on one row
     columns : (H, W) places in the rectified image.
     row_scale, column_scale : (value at pixel 0, change per pixel) of the scaled row coordinate and of scaled u.
-    affine : (2, 3) plane coordinates of (u scaled, v scaled, 1).
-    first, second : (H, W) results; `outside` beyond the limit of the scaled coordinates.
+    affine : (2, 3) film coordinates of (u scaled, v scaled, 1).
+    film_mm : (H, W, 2) result; NaN beyond the limit of the scaled coordinates.
     """
     count_u, count_v = powers.shape
     height, width = columns.shape
@@ -109,8 +107,8 @@ def pixels_to_plane(
             inside = abs(reached[x]) <= limit
             a = a_u * u[x] + a_v * v[x] + a_1
             b = b_u * u[x] + b_v * v[x] + b_1
-            first[y, x] = a if inside else outside
-            second[y, x] = b if inside else outside
+            film_mm[y, x, 0] = a if inside else np.nan
+            film_mm[y, x, 1] = b if inside else np.nan
 
 
 @njit(nogil=True, cache=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from functools import cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -17,6 +18,7 @@ from cosp.epipolar.directions import common_directions_rad
 from cosp.epipolar.polynomials import Basis, Fit, evaluate, fit, fit_quality, fit_row_functions
 from cosp.errors import NoOverlapError
 from cosp.geometry.grids import PixelGrid
+from cosp.geometry.lattices import between_nodes
 from cosp.geometry.robust import tukey_weights
 from cosp.imaging.windows import Window
 
@@ -27,6 +29,11 @@ _INVERSE_MORE = (3, 5)
 # The correction of rows changes by less than a hundredth of a pixel per pixel: each step gains two digits or more.
 _CORRECTION_STEPS = 4
 _ROBUST_STEPS = 6
+# Pixels from one place of the image to the next whose film point is worked out for a picture; straight lines between
+# them are within 1e-3 px.
+_NODE_PX = 8
+_PER_PIXEL = (1 / _NODE_PX, 1 / _NODE_PX)
+_FAR_PX = -6e7  # stands for "nowhere": still far away when mixed with a 64th, still in range for OpenCV
 # Nodes a side at which the extent of a window on the film is looked up.
 _LATTICE = 33
 # Terms of disparity at a given height as a function of the place on the fore film.
@@ -112,7 +119,7 @@ class EpipolarMap:
             rows = np.broadcast_to(rows, shape).reshape(flat)
         columns = np.broadcast_to(columns, shape).reshape(flat)
         film_mm = np.empty((*flat, 2))
-        self._to_plane(rows, columns, self._film_affine(), math.nan, film_mm[..., 0], film_mm[..., 1])
+        self._to_film(rows, columns, film_mm)
         return film_mm.reshape(*shape, 2)
 
     def film_window(self, window: Window, film_grid: PixelGrid) -> Window:
@@ -137,16 +144,19 @@ class EpipolarMap:
     ) -> tuple[Float32Array, Float32Array]:
         """Row and column in the film raster of each pixel of a window of the rectified image, (H, W) float32.
 
-        Relative to a corner (row, column) near by, so that they are good to 1/1000 px; far outside (-1e6) where the
-        film is not known.
+        Relative to a corner (row, column) near by, so that they are good to 1/1000 px; far outside (below
+        -500 000) where the film is not known, or not at the nodes about the pixel.
         """
-        affine = self._film_affine()
-        affine[:, 2] -= (film_grid.x0 + corner[1] * film_grid.step_x, film_grid.y0 + corner[0] * film_grid.step_y)
-        affine /= np.array([[film_grid.step_x], [film_grid.step_y]])
-        film_rows, film_columns = np.empty(window.shape, np.float32), np.empty(window.shape, np.float32)
-        rows = np.arange(float(window.row0), float(window.row1))[:, None]
-        columns = np.arange(float(window.column0), float(window.column1))[None, :]
-        self._to_plane(rows, columns, affine, -1e6, film_columns, film_rows)
+        # Nodes lie at the same pixels whatever the window, and so does what is between them.
+        row0, column0 = (start // _NODE_PX * _NODE_PX for start in (window.row0, window.column0))
+        rows = np.arange(row0, window.row1 + _NODE_PX, _NODE_PX, dtype=float)[:, None]
+        columns = np.arange(column0, window.column1 + _NODE_PX, _NODE_PX, dtype=float)[None, :]
+        nodes = film_grid.pixels(self.film(rows, columns))
+        first = ((window.row0 - row0) / _NODE_PX, (window.column0 - column0) / _NODE_PX)
+        film_rows, film_columns = (
+            between_nodes(np.where(np.isfinite(node), node - start, _FAR_PX), first, _PER_PIXEL, window.shape)
+            for node, start in zip(nodes, corner, strict=True)
+        )
         return film_rows, film_columns
 
     def _uncorrected_rows(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
@@ -157,27 +167,18 @@ class EpipolarMap:
             rows, columns, pixel_mm=self.pixel_mm, row0_mm=self.row0_mm, column0_mm=self.column0_mm
         )
 
-    def _film_affine(self) -> FloatArray:
-        """(2, 3) film coordinates of (scaled u, scaled v, 1)."""
+    def _to_film(self, rows: FloatArray, columns: FloatArray, film_mm: FloatArray) -> None:
+        """Fill (H, W, 2) with the film points of rows, (H, W) or (H, 1), and columns (H, W)."""
         scaled = self._axes * np.array([self.half_u_mm, self.half_v_mm])
-        return np.column_stack([scaled, np.array(self.centre_mm)])
-
-    def _to_plane(
-        self, rows: FloatArray, columns: FloatArray, affine: FloatArray, outside: float, first: Any, second: Any
-    ) -> None:
-        """Fill two (H, W) arrays with the places of pixels in the plane that the affine leads to."""
-        columns = np.broadcast_to(columns, first.shape)
-        kernels.pixels_to_plane(
-            np.apply_along_axis(_powers, 0, self.inverse / self.half_v_mm),
+        kernels.film_points(
+            _powers_of_chebyshev(len(self.inverse)) @ (self.inverse / self.half_v_mm),
             self._uncorrected_rows(rows, columns),
             columns,
             ((self.row0_mm - self.row_centre_mm) / self.row_half_mm, self.pixel_mm / self.row_half_mm),
             (self.column0_mm / self.half_u_mm, self.pixel_mm / self.half_u_mm),
             1 + _BEYOND,
-            affine,
-            outside,
-            first,
-            second,
+            np.column_stack([scaled, np.array(self.centre_mm)]),
+            film_mm,
         )
 
 
@@ -485,7 +486,8 @@ def _range_over(rectification: Rectification, window: Window) -> tuple[float, fl
     return float(np.nanmin(low)), float(np.nanmax(high))
 
 
-def _powers(coefficients: FloatArray) -> FloatArray:
-    """Coefficients of powers from those of a Chebyshev series, of the same length."""
-    powers = chebyshev.cheb2poly(coefficients)
-    return np.asarray(np.pad(powers, (0, coefficients.size - powers.size)))
+@cache
+def _powers_of_chebyshev(count: int) -> FloatArray:
+    """Matrix (count, count) that makes coefficients of powers from those of a Chebyshev series."""
+    columns = (chebyshev.cheb2poly(series) for series in np.eye(count))
+    return np.stack([np.pad(powers, (0, count - powers.size)) for powers in columns], axis=1)

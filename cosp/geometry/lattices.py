@@ -1,4 +1,4 @@
-"""Smooth functions of the map on every pixel of a grid, from a few exact values."""
+"""Smooth functions on every pixel of a grid, from a few exact values."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cosp.arrays import FloatArray
+from cosp.arrays import Float32Array, FloatArray
+from cosp.geometry import kernels
 from cosp.geometry.grids import PixelGrid
 
 
@@ -29,6 +30,30 @@ def smooth_on_grid(function: Callable[[FloatArray], FloatArray], grid: PixelGrid
     columns, of_columns = _chebyshev(grid.shape[1], degree)
     values = np.moveaxis(np.asarray(function(grid.points(rows[:, None], columns[None, :])), float), -1, 0)
     return np.asarray(of_rows @ values @ of_columns.T)
+
+
+def between_nodes(
+    values: FloatArray, first: tuple[float, float], step: tuple[float, float], shape: tuple[int, int]
+) -> Float32Array:
+    """A lattice at every pixel of a picture, bilinear between its nodes; its edge values go on beyond it.
+
+    Parameters
+    ----------
+    values : (R, C) array
+        NaN makes NaN of what lies beside it.
+    first : (row, column)
+        Place of the first pixel among the nodes.
+    step : (row, column)
+        How far among the nodes the next pixel is; positive.
+    shape : (H, W)
+
+    Returns
+    -------
+    (H, W) array
+    """
+    result = np.empty(shape, np.float32)
+    kernels.between_nodes(np.ascontiguousarray(values, float), first, step, result)
+    return result
 
 
 def _chebyshev(length: int, degree: int) -> tuple[FloatArray, FloatArray]:

@@ -12,10 +12,10 @@ import numpy as np
 from cosp.arrays import Float32Array, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
+from cosp.geometry.lattices import between_nodes
 from cosp.geometry.rays import Rays
 from cosp.imaging.windows import Window
 from cosp.surface import kernels
-from cosp.surface.nodes import between_nodes
 
 _CHECKED_EVERY = 8  # cells along, at which a table is held against rays between its nodes
 _BLOCK_NODES = 20_000  # nodes whose rays are asked for at a time
@@ -280,8 +280,9 @@ class PixelIntersection:
         """Values at nodes, at every pixel of a window."""
         return between_nodes(
             values,
-            (np.arange(window.row0, window.row1) - nodes.y0) / nodes.step_y,
-            (np.arange(window.column0, window.column1) - nodes.x0) / nodes.step_x,
+            ((window.row0 - nodes.y0) / nodes.step_y, (window.column0 - nodes.x0) / nodes.step_x),
+            (1 / nodes.step_y, 1 / nodes.step_x),
+            window.shape,
         )
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from cosp.geometry.grids import PixelGrid
+from cosp.geometry.lattices import between_nodes
 from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 from cosp.surface import kernels
-from cosp.surface.nodes import between_nodes
 
 _NODE_CELLS = 32  # the direction to the lens changes by a millionth per metre: linear between such nodes
 
@@ -40,8 +40,8 @@ def direction_to_lens(
     rows, columns = (np.arange(0, n + _NODE_CELLS, _NODE_CELLS) for n in grid.shape)
     nodes = grid.points(rows[:, None], columns[None, :])
     moved = (locate(film_mm(nodes, 0.0), rise_m) - nodes) / rise_m
-    at = [np.arange(n) / _NODE_CELLS for n in grid.shape]
-    east, north = (between_nodes(moved[..., i], *at) for i in range(2))
+    step = (1 / _NODE_CELLS, 1 / _NODE_CELLS)
+    east, north = (between_nodes(moved[..., i], (0.0, 0.0), step, grid.shape) for i in range(2))
     return east, north
 
 
