@@ -37,6 +37,8 @@ SAMPLE_BLOCK = 16  # pixels that the vector resampling takes at once
 RIM = 4  # zeros around a picture that is resampled: what is read at once reaches so far
 HALF_ROWS, HALF_COLUMNS = CENSUS_ROWS // 2, CENSUS_COLUMNS // 2
 CENTRE = HALF_ROWS * CENSUS_COLUMNS + HALF_COLUMNS
+CORRELATED = 15  # side of the window in which pictures must look alike, a multiple of three
+MID_GREY = 128
 
 # No data looks equally unlike everything, itself in the other picture included: these two patterns differ in half their
 # bits from each other and, on average, from any census.
@@ -963,75 +965,88 @@ def _add_line(line: Any, sign: int, saturated_from: int, sums: Any, squares: Any
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def correlate_windows(left: Any, right: Any, half: int, least_variance: float, found: Any) -> None:
-    """Normalised correlation of two pictures in the windows of 2 half + 1 pixels a side about every pixel.
+def correlate_windows(left: Any, right: Any, least_variance: float, found: Any) -> None:
+    """Normalised correlation of two pictures in the windows of CORRELATED pixels a side about every pixel.
 
-    Windows are cut at the picture's edges. Grey values are counted from mid-grey, so that integers of 32 bits hold
-    windows of up to 15 pixels a side exactly. least_variance: geometric mean of the variances from which it counts.
+    Windows are cut at the picture's edges. Grey values are counted from mid-grey, so that integers of 16 and 32 bits
+    hold windows of 15 pixels a side exactly. least_variance: geometric mean of the variances from which it counts.
     """
     rows, columns = left.shape
-    side = 2 * half + 1
-    # Down the window's height, with nothing beside the picture: a, b, a^2, b^2, ab; then summed from the left.
-    beyond = columns + 2 * half
-    sums_a, sums_b = np.zeros(beyond, np.int32), np.zeros(beyond, np.int32)
-    sums_aa, sums_bb, sums_ab = np.zeros(beyond, np.int32), np.zeros(beyond, np.int32), np.zeros(beyond, np.int32)
-    inner_a, inner_b = sums_a[half:], sums_b[half:]
-    inner_aa, inner_bb, inner_ab = sums_aa[half:], sums_bb[half:], sums_ab[half:]
-    running = np.zeros((5, columns + side), np.int32)
-    widths = np.empty(columns, np.int32)
-    for column in range(columns):
-        widths[column] = min(column + half, columns - 1) - max(column - half, 0) + 1
+    half = CORRELATED // 2
+    # Sums down the window's height, with nothing beside the picture: a, b; a^2, b^2, ab. Then of three such side by
+    # side, five of which are a window.
+    sums, threes = np.zeros((2, columns + CORRELATED), np.int16), np.zeros((2, columns + CORRELATED), np.int16)
+    squares, three_squares = (
+        np.zeros((3, columns + CORRELATED), np.int32),
+        np.zeros((3, columns + CORRELATED), np.int32),
+    )
+    a_sums, b_sums, aa_sums, bb_sums, ab_sums = sums[0], sums[1], squares[0], squares[1], squares[2]
+    a_threes, b_threes = threes[0], threes[1]
+    aa_threes, bb_threes, ab_threes = three_squares[0], three_squares[1], three_squares[2]
+    beyond = np.full(columns, MID_GREY, np.uint8)
+    sizes = np.empty(columns, np.float32)
     least = np.float32(least_variance * least_variance)
     for row in range(-half, rows):
-        if row + half < rows:
-            _add_values(left[row + half], np.int32(1), inner_a, inner_aa)
-            _add_values(right[row + half], np.int32(1), inner_b, inner_bb)
-            _add_products(left[row + half], right[row + half], np.int32(1), inner_ab)
-        if row - half - 1 >= 0:
-            _add_values(left[row - half - 1], np.int32(-1), inner_a, inner_aa)
-            _add_values(right[row - half - 1], np.int32(-1), inner_b, inner_bb)
-            _add_products(left[row - half - 1], right[row - half - 1], np.int32(-1), inner_ab)
+        below, above = row + half, row - half - 1
+        a_new, a_old = left[below] if below < rows else beyond, left[above] if above >= 0 else beyond
+        b_new, b_old = right[below] if below < rows else beyond, right[above] if above >= 0 else beyond
+        _shift_sums(a_new, a_old, a_sums[half:])
+        _shift_sums(b_new, b_old, b_sums[half:])
+        _shift_products(a_new, a_new, a_old, a_old, aa_sums[half:])
+        _shift_products(b_new, b_new, b_old, b_old, bb_sums[half:])
+        _shift_products(a_new, b_new, a_old, b_old, ab_sums[half:])
         if row < 0:
             continue
-        a, b, aa, bb, ab = np.int32(0), np.int32(0), np.int32(0), np.int32(0), np.int32(0)
-        for column in range(columns + 2 * half):
-            a, b = np.int32(a + sums_a[column]), np.int32(b + sums_b[column])
-            aa, bb = np.int32(aa + sums_aa[column]), np.int32(bb + sums_bb[column])
-            ab = np.int32(ab + sums_ab[column])
-            running[0, column + 1], running[1, column + 1] = a, b
-            running[2, column + 1], running[3, column + 1], running[4, column + 1] = aa, bb, ab
-        height = np.int32(min(row + half, rows - 1) - max(row - half, 0) + 1)
+        _add_threes(a_sums, a_threes)
+        _add_threes(b_sums, b_threes)
+        _add_threes(aa_sums, aa_threes)
+        _add_threes(bb_sums, bb_threes)
+        _add_threes(ab_sums, ab_threes)
+        height = min(row + half, rows - 1) - max(row - half, 0) + 1
         for column in range(columns):
-            a = np.int32(running[0, column + side] - running[0, column])
-            b = np.int32(running[1, column + side] - running[1, column])
-            aa = np.int32(running[2, column + side] - running[2, column])
-            bb = np.int32(running[3, column + side] - running[3, column])
-            ab = np.int32(running[4, column + side] - running[4, column])
-            size = np.int32(height * widths[column])
+            width = min(column + half, columns - 1) - max(column - half, 0) + 1
+            sizes[column] = np.float32(height * width)
+        target = found[row]
+        for column in range(columns):
+            a, b = _window(a_threes, column), _window(b_threes, column)
+            aa, bb, ab = _window(aa_threes, column), _window(bb_threes, column), _window(ab_threes, column)
+            area = sizes[column]
+            size = np.int32(area)
             covariance = np.int32(np.int32(size * ab) - np.int32(a * b))  # size^2 times it
             one = np.int32(np.int32(size * aa) - np.int32(a * a))
             other = np.int32(np.int32(size * bb) - np.int32(b * b))
-            area = np.float32(np.int32(size * size))
-            variances = max(np.float32(one) * np.float32(other), least * area * area)
-            found[row, column] = np.float32(covariance) / np.sqrt(variances)
+            variances = max(np.float32(one) * np.float32(other), least * (area * area) * (area * area))
+            target[column] = np.float32(covariance) / np.sqrt(variances)
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _add_values(line: Any, sign: int, sums: Any, squares: Any) -> None:
-    """Add (or take away) a line of grey values, counted from mid-grey, and their squares."""
-    for column in range(len(line)):
-        value = np.int32(np.int32(line[column]) - np.int32(128))
-        sums[column] += np.int32(sign * value)
-        squares[column] += np.int32(sign * np.int32(value * value))
+def _shift_sums(entering: Any, leaving: Any, sums: Any) -> None:
+    for column in range(len(entering)):
+        change = np.int16(np.int16(entering[column]) - np.int16(leaving[column]))
+        sums[column] = np.int16(sums[column] + change)
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _add_products(left: Any, right: Any, sign: int, products: Any) -> None:
-    """Add (or take away) the products of two lines of grey values, counted from mid-grey."""
-    for column in range(len(left)):
-        a = np.int32(np.int32(left[column]) - np.int32(128))
-        b = np.int32(np.int32(right[column]) - np.int32(128))
-        products[column] += np.int32(sign * np.int32(a * b))
+def _shift_products(a_entering: Any, b_entering: Any, a_leaving: Any, b_leaving: Any, sums: Any) -> None:
+    """Add the products of two lines of grey values, counted from mid-grey, and take away those of two others."""
+    for column in range(len(a_entering)):
+        a, b = np.int32(a_entering[column]) - MID_GREY, np.int32(b_entering[column]) - MID_GREY
+        c, d = np.int32(a_leaving[column]) - MID_GREY, np.int32(b_leaving[column]) - MID_GREY
+        sums[column] = np.int32(sums[column] + np.int32(np.int32(a * b) - np.int32(c * d)))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _add_threes(sums: Any, threes: Any) -> None:
+    for column in range(len(sums) - 2):
+        threes[column] = sums[column] + sums[column + 1] + sums[column + 2]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _window(threes: Any, column: int) -> int:
+    total = np.int32(0)
+    for third in range(0, CORRELATED, 3):
+        total = np.int32(total + np.int32(threes[column + third]))
+    return total
 
 
 @njit(nogil=True, cache=True)
@@ -1253,6 +1268,17 @@ def _node(place: float, count: int) -> tuple[int, np.float32]:
     place = min(max(place, 0.0), count - 1.0)
     first = min(int(place), max(count - 2, 0))
     return first, np.float32(place - first)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def weigh_means(means: Any, seen: Any) -> None:
+    """Turn means over zeros, too, into means of what was seen (of 255), and into 0 where that is less than half."""
+    for row in range(means.shape[0]):
+        for column in range(means.shape[1]):
+            share = np.float32(seen[row, column])
+            value = np.rint(np.float32(means[row, column]) * (np.float32(255) / share))
+            value = min(max(value, np.float32(1)), np.float32(255))
+            means[row, column] = np.uint8(np.int32(value)) if share >= 128 else np.uint8(0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -124,10 +124,7 @@ def picture_pyramid(image: ByteArray, levels: int) -> list[ByteArray]:
         coarser = np.asarray(cv2.pyrDown(finer), np.uint8)
         if not finer.all():
             seen = cv2.pyrDown(cv2.threshold(finer, 0, 255, cv2.THRESH_BINARY)[1])
-            mixed = np.nonzero((seen < 255) & (seen >= 128))
-            means = coarser[mixed] * (np.float32(255) / seen[mixed])
-            coarser[seen < 128] = 0
-            coarser[mixed] = np.clip(np.rint(means), 1, 255)
+            kernels.weigh_means(coarser, seen)
         pyramid.append(coarser)
     return pyramid
 

@@ -14,7 +14,7 @@ from cosp.dense.census import lacks_data
 from cosp.dense.memory import Workspace
 from cosp.geometry.statistics import summarise
 
-CORRELATION_WINDOW_PX = 15
+CORRELATION_WINDOW_PX = kernels.CORRELATED
 """Side of the window in which the two pictures must look alike."""
 
 TEXTURE_WINDOW_PX = 9
@@ -82,7 +82,7 @@ def correlation(left: ByteArray, right: ByteArray, memory: Workspace | None = No
     """
     found: Float32Array = (memory or Workspace()).array("correlation", left.shape, np.float32)
     # A variance of a quarter grey value squared is the rounding of a flat picture.
-    kernels.correlate_windows(left, right, CORRELATION_WINDOW_PX // 2, 0.25, found)
+    kernels.correlate_windows(left, right, 0.25, found)
     return found
 
 
