@@ -30,6 +30,7 @@ rule adjust_bundle:
         gcps=of_block("results/scenes/{scene}/gcps.parquet"),
         footprints=of_block("results/scenes/{scene}/footprint.json"),
         films=of_block("results/scenes/{scene}/film.json"),
+        seams=of_block("results/scenes/{scene}/seams.json"),
         tie_points=of_pairs_of_block("results/pairs/{pair}/tie_points.parquet"),
         neighbour_points=of_neighbours(
             "results/blocks/{block}/neighbours/{first}_{second}.parquet"

@@ -8,9 +8,12 @@ from pyproj import Transformer
 
 from cosp.adjustment import blocks, precision
 from cosp.adjustment.calibration import FieldChoices
+from cosp.adjustment.fieldprior import joints_on_film
 from cosp.adjustment.observations import Control, HeightReference, Ties
 from cosp.adjustment.posterior import height_sigma
 from cosp.camera.panoramic import PanoramicCamera
+from cosp.film.joining import Layout
+from cosp.film.scanner import Blocks
 from cosp.geometry.frames import LocalFrame
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.resampling import sample
@@ -29,6 +32,7 @@ def adjust_bundle(
     neighbour_paths,
     footprint_paths,
     film_paths,
+    seams_paths,
     reference_dem_path,
     unstable_path,
     cameras_folder,
@@ -56,11 +60,16 @@ def adjust_bundle(
     tie_distortion_um,
     gate_sigma,
     correlation_limit,
+    joint_sigma_px,
+    block_sigma_px,
+    focal_length,
+    focal_sigma_mm,
     grid_step_mm,
     grid_radius_mm,
 ):
     gcps = [tables.read(path) for path in gcp_paths]
-    pixels_mm = [records.read_json(path)["pixel_mm"] for path in film_paths]
+    films = [records.read_json(path) for path in film_paths]
+    pixels_mm = [film["pixel_mm"] for film in films]
     footprints = [records.read_json(path) for path in footprint_paths]
     placed = [
         records.from_plain(footprint["camera"], PanoramicCamera, str(path))
@@ -102,6 +111,11 @@ def adjust_bundle(
         "gate_sigma": gate_sigma,
         "film_groups": film_groups,
         "place_sigmas_m": [footprint.get("sigma_m", np.nan) for footprint in footprints],
+        "joints": [
+            film_joints(path, film, camera, joint_sigma_px, block_sigma_px)
+            for path, film, camera in zip(seams_paths, films, cameras, strict=True)
+        ],
+        "focal_sigma_mm": focal_sigma_mm if focal_length == "free" else None,
     }
 
     block = blocks.orient_block(
@@ -130,6 +144,7 @@ def adjust_bundle(
         film_distortion_mm=film_distortion_um / 1000.0,
         tie_distortion_mm=tie_distortion_um / 1000.0,
         correlation_limit=correlation_limit,
+        focal_sigma_mm=choices["focal_sigma_mm"],
     )
 
     for camera in final.adjustment.cameras:
@@ -197,6 +212,34 @@ def tie_points(table, names, first, second, pixels_mm):
         second_mm=table[[f"{names[1]}_x_mm", f"{names[1]}_y_mm"]].to_numpy(),
         sigma_mm=table.sigma_px.to_numpy() * pixels_mm[first],
         neighbours=names == ("first", "second"),
+    )
+
+
+def film_joints(seams_path, film, camera, joint_sigma_px, block_sigma_px):
+    """Where on a film its parts were joined and, where they were found, the limits of the scanner's blocks lie."""
+    seams = records.read_json(seams_path)
+    layout = records.from_plain(seams["layout"], Layout, f"{seams_path}: layout")
+    blocks_found = seams["scanner_blocks"]
+    columns = []
+    if blocks_found is not None:
+        scanner = records.from_plain(blocks_found, Blocks, f"{seams_path}: scanner_blocks")
+        ends = [-np.inf, *layout.joints_px, np.inf]
+        for part, motion in enumerate(layout.motions):
+            along = scanner.along(part, layout.shape[1] * seams["pixel_mm"]) / seams["pixel_mm"]
+            joined = motion.apply(np.column_stack([along, np.zeros(len(along))]))[:, 0]
+            columns += joined[(joined > ends[part]) & (joined < ends[part + 1])].tolist()
+    exposure = film["exposure"]
+    sense = -1.0 if film["turned"] else 1.0
+    joints_mm, limits_mm = (
+        sense * (np.array(places) - exposure["centre_px"][0]) * exposure["pixel_mm"]
+        for places in (layout.joints_px, columns)
+    )
+    return joints_on_film(
+        joints_mm,
+        limits_mm,
+        half_length_mm=camera.half_length_mm,
+        joint_sigma_mm=joint_sigma_px * film["pixel_mm"],
+        limit_sigma_mm=block_sigma_px * film["pixel_mm"],
     )
 
 
@@ -367,6 +410,7 @@ if __name__ == "__main__":
             neighbour_paths=list(snakemake.input.neighbour_points),
             footprint_paths=list(snakemake.input.footprints),
             film_paths=list(snakemake.input.films),
+            seams_paths=list(snakemake.input.seams),
             reference_dem_path=snakemake.input.reference_dem,
             unstable_path=snakemake.input.get("unstable_terrain"),
             cameras_folder=snakemake.output.cameras,
@@ -393,6 +437,10 @@ if __name__ == "__main__":
             tie_distortion_um=snakemake.params.tie_distortion_um,
             gate_sigma=snakemake.params.gate_sigma,
             correlation_limit=snakemake.params.correlation_limit,
+            joint_sigma_px=snakemake.params.joint_sigma_px,
+            block_sigma_px=snakemake.params.block_sigma_px,
+            focal_length=snakemake.params.focal_length,
+            focal_sigma_mm=snakemake.params.focal_sigma_mm,
             grid_step_mm=snakemake.params.grid_step_mm,
             grid_radius_mm=snakemake.params.grid_radius_mm,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -13,6 +14,7 @@ from cosp.adjustment import precision
 from cosp.adjustment.bundle import CONTROL_NEEDED, Adjustment, adjust
 from cosp.adjustment.calibration import Calibration, FieldChoices, calibrate
 from cosp.adjustment.carrying import carry
+from cosp.adjustment.fieldprior import Joints
 from cosp.adjustment.observations import (
     FIELD_PRIORS,
     PLAIN_PRIORS,
@@ -25,16 +27,20 @@ from cosp.adjustment.observations import (
 from cosp.adjustment.posterior import place_sigma_m
 from cosp.adjustment.robust import Resection, resect_control
 from cosp.adjustment.solver import END_SIGMA
+from cosp.adjustment.unknowns import PARAMETERS, with_focal_lengths
 from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import NotEnoughMatchesError
 from cosp.geometry.statistics import nmad, rms, summarise
+
+logger = logging.getLogger(__name__)
 
 PointsT = TypeVar("PointsT", Control, Ties)
 
 # The single images are oriented by then: wide enough for what tie points still move.
 SECOND_START_SIGMA = 30.0
 TIES_AT_FIRST = 4000  # of a pair, to begin with
+UNTOLD = 0.5  # of what was believed of a focal length: points that leave so much of it tell nothing
 
 
 @dataclass(frozen=True)
@@ -50,12 +56,15 @@ class OrientedBlock:
         Film fields with everything about them, if they were asked for.
     plain : Adjustment
         The same block without film fields.
+    focal_lengths_mm : tuple of floats
+        Of the cameras before the adjustment.
     """
 
     adjustment: Adjustment
     resections: tuple[Resection | None, ...]
     calibration: Calibration | None
     plain: Adjustment
+    focal_lengths_mm: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -93,6 +102,8 @@ def orient_block(
     held_out: Sequence[BoolArray] | None = None,
     film_groups: Sequence[int] | None = None,
     place_sigmas_m: Sequence[float] | None = None,
+    joints: Sequence[Joints] | None = None,
+    focal_sigma_mm: float | None = None,
 ) -> OrientedBlock:
     """Adjusted cameras of a block.
 
@@ -125,6 +136,10 @@ def orient_block(
         Which images were taken by the same camera.
     place_sigmas_m : sequence of float
         How well each image was placed on the ground; used for those without control. NaN where that is not known.
+    joints : sequence of Joints
+        Of every film: where pieces of it may be off; only with film fields.
+    focal_sigma_mm : float or None
+        Standard deviation of the focal lengths, which are then unknowns too; None: they stay.
 
     Raises
     ------
@@ -168,7 +183,9 @@ def orient_block(
         "priors": PLAIN_PRIORS,
         "gate_sigma": gate_sigma,
         "prior_cameras": means,
-        "information": information if alone.any() else None,
+        "information": _with_lenses(
+            information if alone.any() else np.zeros_like(information), film_groups, focal_sigma_mm
+        ),
         "reference": reference,
     }
     # Far from the solution a part of the tie points does as well as all.
@@ -184,8 +201,9 @@ def orient_block(
     )
     if sum(map(len, thinned)) < sum(map(len, ties)):
         plain = adjust(plain.cameras, allowed, tie_allowed, start_sigma=END_SIGMA, to_reference=held, **options)
+    focal_lengths_mm = tuple(camera.focal_length_mm for camera in cameras)
     if field is None:
-        return OrientedBlock(plain, tuple(resections), None, plain)
+        return OrientedBlock(plain, tuple(resections), None, plain, focal_lengths_mm)
     calibration = calibrate(
         plain.cameras,
         control,
@@ -200,9 +218,10 @@ def orient_block(
         height_weights=plain.height_weights,
         held_out=held_out,
         film_groups=film_groups,
-        coupling=information,
+        coupling=_with_lenses(information, film_groups, focal_sigma_mm),
+        joints=joints,
     )
-    return OrientedBlock(_with_fields(calibration), tuple(resections), calibration, plain)
+    return OrientedBlock(_with_fields(calibration), tuple(resections), calibration, plain, focal_lengths_mm)
 
 
 def with_checks(
@@ -217,6 +236,8 @@ def with_checks(
     gate_sigma: float,
     film_groups: Sequence[int] | None = None,
     place_sigmas_m: Sequence[float] | None = None,
+    joints: Sequence[Joints] | None = None,
+    focal_sigma_mm: float | None = None,
 ) -> OrientedBlock:
     """The block adjusted once more with its check points as control and no height held out.
 
@@ -231,7 +252,7 @@ def with_checks(
         Per image.
     ties : sequence of Ties
     prior_cameras : sequence of PanoramicCamera
-    field, reference, gate_sigma, film_groups, place_sigmas_m
+    field, reference, gate_sigma, film_groups, place_sigmas_m, joints, focal_sigma_mm
         As for `orient_block`.
     """
     if block.calibration is None:
@@ -248,7 +269,10 @@ def with_checks(
         choices=replace(field, lengths_mm=(block.calibration.prior.length_mm,)),
         gate_sigma=gate_sigma,
         film_groups=film_groups,
-        coupling=_information(prior_cameras, control, film_groups, place_sigmas_m),
+        coupling=_with_lenses(
+            _information(prior_cameras, control, film_groups, place_sigmas_m), film_groups, focal_sigma_mm
+        ),
+        joints=joints,
         learned=block.calibration,
     )
     return replace(block, adjustment=_with_fields(calibration), calibration=calibration)
@@ -282,6 +306,16 @@ def _information(
             mine = slice(13 * i, 13 * (i + 1))
             information[mine, mine] += place_information(camera, place_sigmas_m[i])
     return information
+
+
+def _with_lenses(
+    information: FloatArray, film_groups: Sequence[int] | None, focal_sigma_mm: float | None
+) -> FloatArray:
+    """Information of cameras with that of their focal lengths, if these are unknowns."""
+    if focal_sigma_mm is None:
+        return information
+    groups = film_groups if film_groups is not None else range(len(information) // PARAMETERS)
+    return with_focal_lengths(information, list(groups), focal_sigma_mm)
 
 
 def _allowing(points: PointsT, distortion_mm: float) -> PointsT:
@@ -369,6 +403,7 @@ def summary(
     film_distortion_mm: float,
     tie_distortion_mm: float,
     correlation_limit: float,
+    focal_sigma_mm: float | None = None,
 ) -> dict[str, Any]:
     """What is told of an adjustment: the content of adjustment.json.
 
@@ -389,6 +424,8 @@ def summary(
         What the plain model allowed for.
     correlation_limit : float
         Correlations beyond this are listed.
+    focal_sigma_mm : float or None
+        What was believed of the focal lengths, if they were unknowns.
     """
     adjustment = block.adjustment
     cameras = adjustment.cameras
@@ -406,10 +443,16 @@ def summary(
             "other_direction_cost": resection.other_direction_cost if resection else None,
             "image_motion_compensation": asdict(precision.compensation_of(adjusted)),
             "paper_parameters": precision.paper_parameters(adjusted),
+            "focal_length": _lens(final.adjustment, n, focal_sigma_mm),
             "correlations": correlation,
             "film_field": _field_size(adjusted),
+            "film_steps": [] if final.calibration is None else _steps(final.calibration, n),
             "place_sigma_m": place_sigma_m(
-                adjusted, n, covariance=final.adjustment.covariance, calibration=final.calibration, height_m=0.0
+                final.adjustment.cameras,
+                n,
+                covariance=final.adjustment.covariance,
+                calibration=final.calibration,
+                height_m=0.0,
             ),
         }
         for n, (camera, adjusted, points, weights, held_out, resection, correlation, size_mm) in enumerate(
@@ -443,7 +486,7 @@ def summary(
             }
         )
     calibration = block.calibration
-    unknowns = 13.0 * len(cameras)
+    unknowns = float(len(adjustment.covariance))
     if calibration is None:
         allowed = [_allowing(points, film_distortion_mm) for points in control]
         groups = precision.plain_groups(adjustment, allowed, [_allowing(points, tie_distortion_mm) for points in ties])
@@ -465,7 +508,7 @@ def summary(
         "film_field": None
         if calibration is None
         else {**asdict(calibration.prior), "unmodelled_mm": calibration.unmodelled_mm},
-        "groups": precision.group_statistics(*groups, scales),
+        "groups": precision.group_statistics(*groups, scales) + _beliefs(block, focal_sigma_mm),
         "check": {
             "rmse": _rmse(errors),
             "count": len(errors.kept),
@@ -482,6 +525,56 @@ def summary(
         "priors": asdict(PLAIN_PRIORS if calibration is None else FIELD_PRIORS),
         "origin": asdict(cameras[0].origin),
     }
+
+
+def _lens(adjustment: Adjustment, image: int, focal_sigma_mm: float | None) -> dict[str, float | None]:
+    """Focal length of an image, with its standard deviation if it was an unknown; a warning where that says nothing."""
+    camera = adjustment.cameras[image]
+    if focal_sigma_mm is None:
+        return {"mm": camera.focal_length_mm, "sigma_mm": None, "prior_sigma_mm": None}
+    sigma_mm = math.sqrt(adjustment.covariance.diagonal()[adjustment.unknowns * (image + 1) - 1])
+    logger.info("%s: focal length %.3f mm, standard deviation %.3f mm", camera.scene, camera.focal_length_mm, sigma_mm)
+    if sigma_mm > UNTOLD * focal_sigma_mm:
+        logger.warning(
+            "%s: the points hardly tell the focal length: its standard deviation is %.2f mm after %.2f mm before",
+            camera.scene,
+            sigma_mm,
+            focal_sigma_mm,
+        )
+    return {"mm": camera.focal_length_mm, "sigma_mm": sigma_mm, "prior_sigma_mm": focal_sigma_mm}
+
+
+def _steps(calibration: Calibration, image: int) -> list[dict[str, Any]]:
+    """Steps of a film at its joints, with what w-tests say of each being none."""
+    found = []
+    for step in calibration.steps(image):
+        free = np.square(step.prior_sigma_mm) - np.square(step.sigma_mm)
+        told = {"w_test": np.array(step.step_mm) / np.sqrt(np.maximum(free, 1e-12))} if min(step.prior_sigma_mm) else {}
+        found.append({**asdict(step), **told})
+    return found
+
+
+def _beliefs(block: OrientedBlock, focal_sigma_mm: float | None) -> list[dict[str, Any]]:
+    """Statistics of what was believed of steps of film and of focal lengths."""
+    found = []
+    calibration, adjustment = block.calibration, block.adjustment
+    if calibration is not None:
+        steps = calibration.step_columns()
+        variances = calibration.covariance[steps, steps]
+        moves = calibration.pattern_weights[:, calibration.basis.smooth :].ravel()
+        found.append(precision.belief_statistics("step", moves, variances, calibration.scales["step"]))
+    if focal_sigma_mm is not None:
+        # Those of one lens are one belief: each is told by itself here.
+        focal = adjustment.unknowns * np.arange(1, len(adjustment.cameras) + 1) - 1
+        off = [now.focal_length_mm - then for now, then in zip(adjustment.cameras, block.focal_lengths_mm, strict=True)]
+        found.append(
+            precision.belief_statistics(
+                "focal length",
+                np.array(off) / focal_sigma_mm,
+                adjustment.covariance[focal, focal] / focal_sigma_mm**2,
+            )
+        )
+    return [statistics for statistics in found if statistics is not None]
 
 
 def _rmse(errors: CheckErrors) -> dict[str, float]:

@@ -10,11 +10,11 @@ import numpy as np
 from cosp.adjustment.observations import Control, HeightReference, Priors, Ties
 from cosp.adjustment.rows import Rows, control_rows, height_rows, intersections, tie_rows
 from cosp.adjustment.solver import START_SIGMA, Equations, Solution, minimise
+from cosp.adjustment.unknowns import PARAMETERS, values_of, with_values
 from cosp.arrays import BoolArray, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.errors import NotEnoughMatchesError
 
-PARAMETERS = 13
 CONTROL_NEEDED = 7  # two equations each: one more than the 13 unknowns of an image
 
 
@@ -31,8 +31,8 @@ class Adjustment:
         Per set of tie points.
     height_weights : tuple of (N,) arrays
         Of the reference heights of the sets of tie points that were held to them; 0 for the others.
-    covariance : (13 n, 13 n) array
-        Of the parameters of all images, at a variance factor of one.
+    covariance : (P n, P n) array
+        Of the 13 parameters of all images at a variance factor of one; of 14 with a free focal length.
     sigma_naught : float
         Root of the variance factor: one if the given standard deviations are right.
     redundancy : int
@@ -49,6 +49,11 @@ class Adjustment:
     redundancy: int
     cost: float
     iterations: int
+
+    @property
+    def unknowns(self) -> int:
+        """Number P of unknowns of a camera: 13, or 14 with a free focal length."""
+        return len(self.covariance) // len(self.cameras)
 
 
 def adjust(
@@ -84,8 +89,9 @@ def adjust(
         Means of the priors; the start values if left out.
     start_sigma : float
         First width of the robust weights, standard deviations.
-    information : (13 n, 13 n) array
-        What else is believed of the cameras, about `prior_cameras`.
+    information : (P n, P n) array
+        What else is believed of the cameras, about `prior_cameras`. Its size says whether the focal lengths are
+        unknowns too: P is 13 or 14.
     reference : HeightReference
     to_reference : sequence of (N,) arrays of bool
         Tie points that are held to the heights of the reference; none if left out.
@@ -112,63 +118,70 @@ def adjust(
         raise NotEnoughMatchesError(f"{scenes}: {found} of the {needed} control points needed")
 
     information = np.zeros((PARAMETERS * len(cameras),) * 2) if information is None else information.copy()
+    width = len(information) // len(cameras)
     for i, camera in enumerate(prior_cameras or cameras):
-        block = slice(PARAMETERS * i, PARAMETERS * (i + 1))
+        block = slice(width * i, width * i + PARAMETERS)
         information[block, block] += priors.information(camera)
     held = [n for n in range(len(ties)) if reference and to_reference is not None and to_reference[n].any()]
 
     def cameras_of(unknowns: FloatArray) -> list[PanoramicCamera]:
-        rows = unknowns.reshape(-1, PARAMETERS)
-        return [camera.with_parameters(row) for camera, row in zip(cameras, rows, strict=True)]
+        rows = unknowns.reshape(-1, width)
+        return [with_values(camera, row) for camera, row in zip(cameras, rows, strict=True)]
 
     def linearise(unknowns: FloatArray) -> list[Equations]:
         now = cameras_of(unknowns)
         groups = [
-            control_equations(camera, points, first_column=PARAMETERS * i)
+            control_equations(camera, points, i, width)
             for i, (camera, points) in enumerate(zip(now, control, strict=True))
         ]
-        groups += [tie_equations(now, points) for points in ties]
+        groups += [tie_equations(now, points, width) for points in ties]
         if reference is not None and to_reference is not None:
-            groups += [height_equations(now, ties[n], reference, to_reference[n]) for n in held]
+            groups += [height_equations(now, ties[n], reference, to_reference[n], width) for n in held]
         return groups
 
     solution = minimise(
         linearise,
-        np.concatenate([camera.parameters() for camera in cameras]),
+        np.concatenate([values_of(camera, width) for camera in cameras]),
         information,
-        prior_mean=np.concatenate([camera.parameters() for camera in prior_cameras or cameras]),
+        prior_mean=np.concatenate([values_of(camera, width) for camera in prior_cameras or cameras]),
         gate_sigma=gate_sigma,
         start_sigma=start_sigma,
     )
     return _adjustment(cameras_of(solution.unknowns), [len(points) for points in ties], held, solution, information)
 
 
-def control_equations(camera: PanoramicCamera, control: Control, first_column: int = 0) -> Equations:
-    """Whitened equations of the control points of one image in its parameters: two per point."""
-    return _of_cameras(control_rows(camera, control), [first_column])
+def control_equations(
+    camera: PanoramicCamera, control: Control, image: int = 0, unknowns: int = PARAMETERS
+) -> Equations:
+    """Whitened equations of the control points of one image in the unknowns of its camera: two per point."""
+    return _of_cameras(control_rows(camera, control, image, unknowns))
 
 
-def tie_equations(cameras: Sequence[PanoramicCamera], ties: Ties) -> Equations:
-    """Whitened equations of tie points in the parameters of two images, ground points eliminated: one per point."""
-    rows = tie_rows(intersections(cameras, ties), ties)
-    return _of_cameras(rows, [PARAMETERS * image for image in rows.images])
+def tie_equations(cameras: Sequence[PanoramicCamera], ties: Ties, unknowns: int = PARAMETERS) -> Equations:
+    """Whitened equations of tie points in the unknowns of two images, ground points eliminated: one per point."""
+    return _of_cameras(tie_rows(intersections(cameras, ties, unknowns), ties))
 
 
 def height_equations(
-    cameras: Sequence[PanoramicCamera], ties: Ties, reference: HeightReference, chosen: BoolArray
+    cameras: Sequence[PanoramicCamera],
+    ties: Ties,
+    reference: HeightReference,
+    chosen: BoolArray,
+    unknowns: int = PARAMETERS,
 ) -> Equations:
     """Whitened equations that hold the chosen tie points to the reference's heights: one per point."""
-    rows = height_rows(intersections(cameras, ties), ties, cameras, reference)
+    rows = height_rows(intersections(cameras, ties, unknowns), ties, cameras, reference)
     rows.residuals[~chosen] = np.nan
-    return _of_cameras(rows, [PARAMETERS * image for image in rows.images])
+    return _of_cameras(rows)
 
 
-def _of_cameras(rows: Rows, first_columns: Sequence[int]) -> Equations:
+def _of_cameras(rows: Rows) -> Equations:
     jacobian = rows.by_camera()
+    width = jacobian.shape[-1]
     return Equations(
-        columns=np.concatenate([np.arange(first, first + PARAMETERS) for first in first_columns]),
+        columns=np.concatenate([np.arange(width) + width * image for image in rows.images]),
         residuals=rows.residuals,
-        jacobian=jacobian.reshape(*jacobian.shape[:2], PARAMETERS * len(rows.images)),
+        jacobian=jacobian.reshape(*jacobian.shape[:2], width * len(rows.images)),
     )
 
 

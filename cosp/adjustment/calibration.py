@@ -12,8 +12,10 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
 from cosp.adjustment import fieldprior, kernels
+from cosp.adjustment.fieldprior import FieldBasis, Joints
 from cosp.adjustment.observations import Control, HeightReference, Priors, Ties
 from cosp.adjustment.rows import Rows, control_rows, height_rows, intersections, tie_rows
+from cosp.adjustment.unknowns import PARAMETERS, values_of, with_values
 from cosp.arrays import BoolArray, FloatArray, IntArray
 from cosp.camera.field import FilmField
 from cosp.camera.panoramic import PanoramicCamera
@@ -22,8 +24,7 @@ from cosp.geometry.robust import huber_weights
 
 logger = logging.getLogger(__name__)
 
-KINDS = ("gcp", "tie", "dem")
-CAMERA = kernels.CAMERA
+KINDS = ("gcp", "tie", "dem", "step")
 ITERATIONS = 12
 LEARNING_ITERATIONS = 3  # after these the prior and the scales stay, so that the rest can settle
 SETTLED = 1e-2  # rms movement of the observations, in standard deviations
@@ -89,12 +90,13 @@ class Calibration:
     variances : tuple of (M, K) arrays
         Of what the equations compute, in units of their sigmas.
     scales : dict
-        Per kind of observation, by how much its sigmas were too small.
+        Per kind of observation, by how much its sigmas were too small; "step": those of the pieces of film.
     prior : FieldPrior
-    patterns : (S, M) array
-        Patterns of spline coefficients that the fields are sums of.
-    covariance : (n (13 + 2 M),) * 2 array
-        Of the 13 parameters of each camera followed by the weights of its patterns, x and y in turns.
+    basis : FieldBasis
+        Patterns that the fields are sums of.
+    pattern_weights : (n, K, 2) array
+    covariance : (n (P + 2 K),) * 2 array
+        Of the P unknowns of each camera followed by the weights of its K patterns, x and y in turns.
     redundancy : float
     cost : float
     iterations : int
@@ -109,7 +111,8 @@ class Calibration:
     variances: tuple[FloatArray, ...]
     scales: dict[str, float]
     prior: FieldPrior
-    patterns: FloatArray
+    basis: FieldBasis
+    pattern_weights: FloatArray
     covariance: FloatArray
     redundancy: float
     cost: float
@@ -119,12 +122,69 @@ class Calibration:
     @property
     def unknowns(self) -> int:
         """Number of unknowns of an image."""
-        return int(CAMERA + 2 * self.patterns.shape[1])
+        return len(self.covariance) // len(self.cameras)
 
     def camera_columns(self) -> IntArray:
-        """Which of the unknowns are camera parameters, in the order of the images."""
-        first = self.unknowns * np.arange(len(self.cameras))
-        return np.asarray((first[:, None] + np.arange(CAMERA)).ravel())
+        """Which of the unknowns are those of cameras, in the order of the images."""
+        return _camera_columns(len(self.cameras), self.unknowns, 2 * self.basis.count)
+
+    def step_columns(self) -> IntArray:
+        """Which of the unknowns are weights of patterns that move pieces of film."""
+        return _step_columns(len(self.cameras), self.unknowns, self.basis)
+
+    def variances_of(self, rows: Rows) -> FloatArray:
+        """Variances (M, K) of what equations compute."""
+        return computed_variances(rows, self.covariance, self.basis, [_field_of(camera) for camera in self.cameras])
+
+    def steps(self, image: int) -> list[FilmStep]:
+        """Steps at the joints of a film, with their standard deviations."""
+        field = _field_of(self.cameras[image])
+        if field.steps is None:
+            return []
+        splines = field.shape[0] * field.shape[1]
+        # Both components of both edges of every piece.
+        pieces = self.basis.by_component[image][2 * splines : 2 * field.functions]
+        first = self.unknowns * (image + 1) - 2 * self.basis.count
+        mine = slice(first, first + 2 * self.basis.count)
+        covariance = pieces @ self.covariance[mine, mine] @ pieces.T
+        given = self.scales["step"] ** 2 * pieces[:, 2 * self.basis.smooth :] @ pieces[:, 2 * self.basis.smooth :].T
+        middle = np.kron(np.array([[0.5, 0.5]]), np.eye(2))
+        found = []
+        for k, x_mm in enumerate(field.steps.joints_mm):
+            change = np.zeros((2, len(pieces)))
+            change[:, 4 * k : 4 * k + 4], change[:, 4 * k + 4 : 4 * k + 8] = -middle, middle
+            step = change @ field.steps.offsets.ravel()
+            known, believed = (np.diag(change @ of @ change.T) for of in (covariance, given))
+            found.append(
+                FilmStep(
+                    x_mm,
+                    (float(step[0]), float(step[1])),
+                    (float(np.sqrt(known[0])), float(np.sqrt(known[1]))),
+                    (float(np.sqrt(believed[0])), float(np.sqrt(believed[1]))),
+                )
+            )
+        return found
+
+
+@dataclass(frozen=True)
+class FilmStep:
+    """By how much the film steps at a joint, in the middle of its width.
+
+    Parameters
+    ----------
+    x_mm : float
+    step_mm : two floats
+        Along and across the film, from left to right.
+    sigma_mm : two floats
+        Standard deviations.
+    prior_sigma_mm : two floats
+        Before anything was measured.
+    """
+
+    x_mm: float
+    step_mm: tuple[float, float]
+    sigma_mm: tuple[float, float]
+    prior_sigma_mm: tuple[float, float]
 
 
 def calibrate(
@@ -143,6 +203,7 @@ def calibrate(
     held_out: Sequence[BoolArray] | None = None,
     film_groups: Sequence[int] | None = None,
     coupling: FloatArray | None = None,
+    joints: Sequence[Joints] | None = None,
     learned: Calibration | None = None,
 ) -> Calibration:
     """Film fields and cameras of a block that is already adjusted without them.
@@ -173,8 +234,11 @@ def calibrate(
         Tie points whose height is kept from the adjustment, to be checked with.
     film_groups : sequence of int
         Which images were taken by the same camera; such frames share part of their distortion. None do if left out.
-    coupling : (13 n, 13 n) array
-        Information that ties the parameters of different images together, about `prior_cameras`.
+    coupling : (P n, P n) array
+        Information that ties the unknowns of different images together, about `prior_cameras`. Its size says whether
+        the focal lengths are unknowns too: P is 13 or 14.
+    joints : sequence of Joints
+        Of every film: where its pieces may be off. None are if left out.
     learned : Calibration
         Of much the same block: its prior and scales are taken over.
 
@@ -193,37 +257,43 @@ def calibrate(
         knots_along_mm=choices.knots_along_mm,
         knots_across_mm=choices.knots_across_mm,
     )
-    patterns = {length: fieldprior.modes(flat, length) for length in choices.lengths_mm}
-    information = np.zeros((CAMERA * len(cameras),) * 2) if coupling is None else coupling.copy()
+    joints = [Joints() for _ in cameras] if joints is None else joints
+    fields = [fieldprior.field_with_pieces(flat, own) for own in joints]
+    bases = {length: FieldBasis.of(fields, joints, length) for length in choices.lengths_mm}
+    information = np.zeros((PARAMETERS * len(cameras),) * 2) if coupling is None else coupling.copy()
+    width = len(information) // len(cameras)
     for i, camera in enumerate(prior_cameras):
-        mine = slice(CAMERA * i, CAMERA * (i + 1))
+        mine = slice(width * i, width * i + PARAMETERS)
         information[mine, mine] += priors.information(camera)
-    mean = np.stack([camera.parameters() for camera in prior_cameras])
+    mean = np.stack([values_of(camera, width) for camera in prior_cameras])
 
     going_on = all(camera.film_field is not None for camera in cameras)
-    now = list(cameras) if going_on else [replace(camera, film_field=flat) for camera in cameras]
+    now = [
+        camera if going_on else replace(camera, film_field=field) for camera, field in zip(cameras, fields, strict=True)
+    ]
     scales = learned.scales if learned else dict.fromkeys(KINDS, 1.0)
     prior = learned.prior if learned else FieldPrior(choices.lengths_mm[0], fieldprior.EXPECTED_AMPLITUDE_MM, 0.0)
     to_learn = 0 if learned else LEARNING_ITERATIONS
     for iteration in range(ITERATIONS):
         near = going_on or iteration > 0
         early = height_weights is not None and any(weight.any() for weight in height_weights)
-        rows = _linearise(now, control, ties, reference if near or early else None, held_out)
+        rows = _linearise(now, control, ties, reference if near or early else None, held_out, width)
         wide = 1.0 if going_on else WIDE_GATES.get(iteration, 1.0)
         weights = [_weights(group, scales, gate_sigma * (wide if group.kind == "dem" else 1.0)) for group in rows]
         if not near and control_weights is not None and tie_weights is not None:
             weights = [*control_weights, *tie_weights, *(height_weights or ())][: len(rows)]
         groups = [_Normal.of(group, weight, now) for group, weight in zip(rows, weights, strict=True)]
-        away = mean - np.stack([camera.parameters() for camera in now])
+        away = mean - np.stack([values_of(camera, width) for camera in now])
         block = _Block(groups, scales, len(now), information, away)
         learning = iteration < to_learn
         if learning:
-            prior = block.learn_prior(patterns, film_groups, ties)
-        solved = block.solve(patterns[prior.length_mm], prior, film_groups, with_covariance=learning and near)
-        moved = block.movement(solved, now, patterns[prior.length_mm])
-        now = solved.applied(now, patterns[prior.length_mm])
+            prior = block.learn_prior(bases, film_groups, ties)
+        basis = bases[prior.length_mm]
+        solved = block.solve(basis, prior, film_groups, with_covariance=learning and near)
+        moved = block.movement(solved, now, basis)
+        now = solved.applied(now, basis)
         if learning and near:
-            scales = block.scales_after(solved, rows, weights, patterns[prior.length_mm])
+            scales = block.scales_after(solved, rows, weights, basis)
         logger.info(
             "film fields, iteration %d: length %.0f mm, amplitude %.2f um, share %.2f; scales %s; moved %.3f sigma",
             iteration + 1,
@@ -235,8 +305,8 @@ def calibrate(
         )
         if iteration >= to_learn and moved < SETTLED:
             break
-    solved = block.solve(patterns[prior.length_mm], prior, film_groups, with_covariance=True)
-    return _result(now, rows, weights, scales, prior, patterns[prior.length_mm], block, solved, iteration + 1)
+    solved = block.solve(basis, prior, film_groups, with_covariance=True)
+    return _result(now, rows, weights, scales, prior, basis, block, solved, iteration + 1)
 
 
 def _linearise(
@@ -245,12 +315,14 @@ def _linearise(
     ties: Sequence[Ties],
     reference: HeightReference | None,
     held_out: Sequence[BoolArray] | None,
+    unknowns: int,
 ) -> list[Rows]:
     """Control of every image, then the conditions of all tie points, then their heights."""
     rows = [
-        control_rows(camera, points, image) for image, (camera, points) in enumerate(zip(cameras, control, strict=True))
+        control_rows(camera, points, image, unknowns)
+        for image, (camera, points) in enumerate(zip(cameras, control, strict=True))
     ]
-    at = [intersections(cameras, points) for points in ties]
+    at = [intersections(cameras, points, unknowns) for points in ties]
     rows += [tie_rows(where, points) for where, points in zip(at, ties, strict=True)]
     if reference is not None:
         for n, (where, points) in enumerate(zip(at, ties, strict=True)):
@@ -270,7 +342,7 @@ def _weights(rows: Rows, scales: dict[str, float], gate_sigma: float) -> FloatAr
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations of one group in parameters and spline coefficients, the latter in total, not as changes."""
+    """Normal equations of one group in cameras and functions of the fields, the latter in total, not as changes."""
 
     kind: str
     images: tuple[int, ...]
@@ -280,52 +352,77 @@ class _Normal:
 
     @classmethod
     def of(cls, rows: Rows, weights: FloatArray, cameras: Sequence[PanoramicCamera]) -> _Normal:
-        field = _field_of(cameras[0])
-        width = CAMERA + 2 * field.shape[0] * field.shape[1]
+        fields = [_field_of(camera) for camera in cameras]
+        functions = max(field.functions for field in fields)
+        by_camera = rows.by_camera()
+        unknowns = by_camera.shape[-1]
+        width = unknowns + 2 * functions
         size = width * len(rows.images)
         normal, right = np.zeros((size, size)), np.zeros(size)
-        splines, values = spline_values(rows, field)
         kernels.accumulate(
-            rows.residuals, weights, rows.by_film, rows.by_camera(), splines, values, width, normal, right
+            rows.residuals, weights, rows.by_film, by_camera, *function_values(rows, fields), width, normal, right
         )
         normal = np.tril(normal) + np.tril(normal, -1).T
-        present = np.concatenate(
-            [np.append(np.zeros(CAMERA), _field_of(cameras[image]).coefficients) for image in rows.images]
-        )
-        return cls(rows.kind, rows.images, normal, right + normal @ present)
+        present = np.zeros((len(rows.images), width))
+        for place, image in zip(present, rows.images, strict=True):
+            place[unknowns : unknowns + 2 * fields[image].functions] = fields[image].amounts.ravel()
+        return cls(rows.kind, rows.images, normal, right + normal @ present.ravel())
 
-    def of_patterns(self, patterns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The same in parameters and weights of patterns; kept, since it is asked for again and again."""
-        if id(patterns) not in self.reduced:
-            self.reduced[id(patterns)] = self._of_patterns(patterns)
-        return self.reduced[id(patterns)]
+    def of_patterns(self, basis: FieldBasis) -> tuple[FloatArray, FloatArray]:
+        """The same in cameras and weights of patterns; kept, since it is asked for again and again."""
+        if id(basis) not in self.reduced:
+            self.reduced[id(basis)] = self._of_patterns(basis)
+        return self.reduced[id(basis)]
 
-    def _of_patterns(self, patterns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        by_pattern = np.kron(patterns, np.eye(2))
-        width = CAMERA + len(by_pattern)
-        blocks = self.normal.reshape(len(self.images), width, len(self.images), width)
-        rows = np.concatenate([blocks[:, :CAMERA], _left(by_pattern, blocks[:, CAMERA:])], axis=1)
-        both = np.concatenate([rows[..., :CAMERA], rows[..., CAMERA:] @ by_pattern], axis=-1)
-        right = self.right.reshape(-1, width)
-        reduced = CAMERA + by_pattern.shape[1]
+    def _of_patterns(self, basis: FieldBasis) -> tuple[FloatArray, FloatArray]:
+        width = len(self.normal) // len(self.images)
+        unknowns = width - 2 * basis.functions
+        to_patterns = [basis.by_component[image] for image in self.images]
         return (
-            both.reshape(len(self.images) * reduced, -1),
-            np.concatenate([right[:, :CAMERA], right[:, CAMERA:] @ by_pattern], axis=1).ravel(),
+            _in_other_unknowns(self.normal, unknowns, to_patterns),
+            np.concatenate(
+                [
+                    np.append(part[:unknowns], part[unknowns:] @ by_pattern)
+                    for part, by_pattern in zip(self.right.reshape(-1, width), to_patterns, strict=True)
+                ]
+            ),
         )
 
 
-def spline_values(rows: Rows, field: FilmField) -> tuple[IntArray, FloatArray]:
-    """Numbers and values (M, I, 12) of the splines at the film points of equations."""
-    splines, values = field.basis(rows.imaged_mm.reshape(-1, 2))
-    shape = (*rows.imaged_mm.shape[:2], splines.shape[1])
-    return splines.reshape(shape), values.reshape(shape)
+def function_values(rows: Rows, fields: Sequence[FilmField]) -> tuple[IntArray, FloatArray]:
+    """Numbers and values (M, I, S) of the functions of the films' fields at the film points of equations."""
+    found = [fields[image].basis(rows.imaged_mm[:, n]) for n, image in enumerate(rows.images)]
+    most = max(values.shape[1] for _, values in found)
+    functions = np.zeros((len(rows.residuals), len(found), most), dtype=np.int64)
+    values = np.zeros(functions.shape)
+    for n, (which, how_much) in enumerate(found):
+        functions[:, n, : which.shape[1]] = which
+        values[:, n, : which.shape[1]] = how_much
+    return functions, values
 
 
-def _left(by_pattern: FloatArray, blocks: FloatArray) -> FloatArray:
-    """Transposed patterns times the second axis of (I, S, I, W) blocks."""
-    images, splines, _, width = blocks.shape
-    product = by_pattern.T @ blocks.reshape(images, splines, images * width)
-    return np.asarray(product.reshape(images, -1, images, width))
+def _in_other_unknowns(matrix: FloatArray, unknowns: int, transforms: Sequence[FloatArray]) -> FloatArray:
+    """A symmetric matrix of the cameras' and other unknowns of some images, the others transformed: T' M T.
+
+    Parameters
+    ----------
+    matrix : (I (P + A), I (P + A)) array
+    unknowns : int
+        P, those of a camera, which stay.
+    transforms : sequence of (A, B) arrays
+        Of every image.
+    """
+    width = len(matrix) // len(transforms)
+    bands = []
+    for a, left in enumerate(transforms):
+        band = matrix[width * a : width * (a + 1)]
+        band = np.concatenate([band[:unknowns], left.T @ band[unknowns:]])
+        parts = []
+        for b, right in enumerate(transforms):
+            part = band[:, width * b : width * (b + 1)]
+            parts += [part[:, :unknowns], part[:, unknowns:] @ right]
+        bands.append(np.concatenate(parts, axis=1))
+    return np.concatenate(bands)
 
 
 def _field_of(camera: PanoramicCamera) -> FilmField:
@@ -336,21 +433,22 @@ def _field_of(camera: PanoramicCamera) -> FilmField:
 
 @dataclass(frozen=True)
 class _Solved:
-    """Changes of the parameters (n, 13), weights of the patterns (n, M, 2), covariance and cost."""
+    """Changes of the cameras' unknowns (n, P), weights of the patterns (n, K, 2), covariance and cost."""
 
     parameters: FloatArray
     pattern_weights: FloatArray
     covariance: FloatArray
     cost: float
 
-    def applied(self, cameras: Sequence[PanoramicCamera], patterns: FloatArray) -> list[PanoramicCamera]:
-        return [
-            replace(
-                camera.with_parameters(camera.parameters() + change),
-                film_field=_field_of(camera).with_coefficients(patterns @ weights),
-            )
-            for camera, change, weights in zip(cameras, self.parameters, self.pattern_weights, strict=True)
-        ]
+    def applied(self, cameras: Sequence[PanoramicCamera], basis: FieldBasis) -> list[PanoramicCamera]:
+        width = self.parameters.shape[1]
+        changed = []
+        for image, camera in enumerate(cameras):
+            field = _field_of(camera)
+            amounts = basis.amounts(image, self.pattern_weights[image])[: field.functions]
+            moved = with_values(camera, values_of(camera, width) + self.parameters[image])
+            changed.append(replace(moved, film_field=field.with_amounts(amounts)))
+        return changed
 
 
 class _Block:
@@ -367,19 +465,19 @@ class _Block:
         self.groups = groups
         self.scales = scales
         self.images = images
+        self.unknowns = len(information) // images  # of a camera
         self.information = information
         self.away = away.ravel()
 
     def learn_prior(
-        self, patterns: dict[float, FloatArray], film_groups: Sequence[int] | None, ties: Sequence[Ties]
+        self, bases: dict[float, FieldBasis], film_groups: Sequence[int] | None, ties: Sequence[Ties]
     ) -> FieldPrior:
         """Length, amplitude and common part with the largest marginal likelihood."""
         pairs: list[tuple[int, ...]] = [(points.first, points.second) for points in ties if not points.neighbours]
         units = pairs or [(image,) for image in range(self.images)]
         units = sorted(set(units), key=self._control_in, reverse=True)[:UNITS_LEARNED_FROM]
         found = {
-            length: np.sum([self._evidence(unit, basis) for unit in units], axis=0)
-            for length, basis in patterns.items()
+            length: np.sum([self._evidence(unit, basis) for unit in units], axis=0) for length, basis in bases.items()
         }
         length = max(found, key=lambda key: float(found[key].max()))
         amplitude = float(fieldprior.AMPLITUDES_MM[int(np.argmax(found[length]))])
@@ -388,7 +486,7 @@ class _Block:
             return prior
         images = self._frames_to_compare(film_groups)
         tried = [replace(prior, share=share) for share in SHARES]
-        return max(tried, key=lambda one: self._evidence_of_share(patterns[length], one, film_groups, images))
+        return max(tried, key=lambda one: self._evidence_of_share(bases[length], one, film_groups, images))
 
     def _frames_to_compare(self, film_groups: Sequence[int]) -> list[int]:
         """Of each camera the frames with most control, so many as tell what they have in common."""
@@ -404,44 +502,48 @@ class _Block:
             sum(np.trace(group.normal) for group in self.groups if group.kind == "gcp" and group.images[0] in unit)
         )
 
-    def assemble(self, patterns: FloatArray, images: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    def assemble(self, basis: FieldBasis, images: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Normal equations of some of the images, without any prior; groups that touch others are left out."""
-        width = CAMERA + 2 * patterns.shape[1]
+        width = self.unknowns + 2 * basis.count
         place = {image: n for n, image in enumerate(images)}
         normal, right = np.zeros((len(images) * width,) * 2), np.zeros(len(images) * width)
         for group in self.groups:
             if not set(group.images) <= set(images):
                 continue
             columns = np.concatenate([np.arange(width) + width * place[image] for image in group.images])
-            matrix, side = group.of_patterns(patterns)
+            matrix, side = group.of_patterns(basis)
             weight = 1.0 / self.scales[group.kind] ** 2
             normal[np.ix_(columns, columns)] += weight * matrix
             right[columns] += weight * side
         return normal, right
 
-    def _evidence(self, unit: Sequence[int], patterns: FloatArray) -> FloatArray:
-        normal, right = self.assemble(patterns, unit)
-        cameras = _camera_columns(len(unit), normal)
-        mine = np.concatenate([np.arange(CAMERA) + CAMERA * image for image in unit])
-        normal[np.ix_(cameras, cameras)] += self.information[np.ix_(mine, mine)]
-        right[cameras] += self.information[np.ix_(mine, mine)] @ self.away[mine]
-        fields = np.setdiff1d(np.arange(len(normal)), cameras)
-        inner = _solve(
-            normal[np.ix_(cameras, cameras)], np.column_stack([normal[np.ix_(cameras, fields)], right[cameras]])
-        )
-        reduced = normal[np.ix_(fields, fields)] - normal[np.ix_(fields, cameras)] @ inner[:, :-1]
-        return fieldprior.log_evidence(reduced, right[fields] - normal[np.ix_(fields, cameras)] @ inner[:, -1])
-
-    def _with_priors(
-        self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int] | None, images: Sequence[int]
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """Normal equations of images with the priors, and the log determinant of the fields' prior information."""
-        normal, right = self.assemble(patterns, images)
-        cameras = _camera_columns(len(images), normal)
-        mine = np.concatenate([np.arange(CAMERA) + CAMERA * image for image in images])
+    def _with_information(self, basis: FieldBasis, images: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Normal equations of some of the images with what is believed of cameras and pieces of film."""
+        normal, right = self.assemble(basis, images)
+        cameras = _camera_columns(len(images), self.unknowns + 2 * basis.count, 2 * basis.count)
+        mine = np.concatenate([np.arange(self.unknowns) + self.unknowns * image for image in images])
         information = self.information[np.ix_(mine, mine)]
         normal[np.ix_(cameras, cameras)] += information
         right[cameras] += information @ self.away[mine]
+        steps = _step_columns(len(images), self.unknowns + 2 * basis.count, basis)
+        normal[steps, steps] += 1.0 / self.scales["step"] ** 2
+        return normal, right
+
+    def _evidence(self, unit: Sequence[int], basis: FieldBasis) -> FloatArray:
+        normal, right = self._with_information(basis, unit)
+        width = self.unknowns + 2 * basis.count
+        first = width * np.arange(len(unit))[:, None] + self.unknowns
+        fields = (first + np.arange(2 * basis.smooth)).ravel()
+        others = np.setdiff1d(np.arange(len(normal)), fields)
+        inner = _solve(normal[np.ix_(others, others)], np.column_stack([normal[np.ix_(others, fields)], right[others]]))
+        reduced = normal[np.ix_(fields, fields)] - normal[np.ix_(fields, others)] @ inner[:, :-1]
+        return fieldprior.log_evidence(reduced, right[fields] - normal[np.ix_(fields, others)] @ inner[:, -1])
+
+    def _with_priors(
+        self, basis: FieldBasis, prior: FieldPrior, film_groups: Sequence[int] | None, images: Sequence[int]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Normal equations of images with the priors, and the log determinant of the fields' prior information."""
+        normal, right = self._with_information(basis, images)
         correlation = np.eye(len(images))
         if film_groups is not None and prior.share > 0.0:
             camera = np.asarray(film_groups)[list(images)]
@@ -449,36 +551,37 @@ class _Block:
             correlation = np.where(same, prior.share, 0.0) + (1.0 - prior.share) * correlation
         precision = np.linalg.inv(correlation) / prior.amplitude_mm**2
         width = len(normal) // len(images)
-        fields = np.arange(CAMERA, width)
+        fields = self.unknowns + np.arange(2 * basis.smooth)
         for i, j in zip(*np.nonzero(precision), strict=True):
             normal[width * i + fields, width * j + fields] += precision[i, j]
         return normal, right, len(fields) * float(np.linalg.slogdet(precision)[1])
 
     def _evidence_of_share(
-        self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int], images: Sequence[int]
+        self, basis: FieldBasis, prior: FieldPrior, film_groups: Sequence[int], images: Sequence[int]
     ) -> float:
-        normal, right, determinant = self._with_priors(patterns, prior, film_groups, images)
+        normal, right, determinant = self._with_priors(basis, prior, film_groups, images)
         factor, scale = _factor(normal)
         solution = scale * cho_solve(factor, scale * right)
         log_normal = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
         return 0.5 * (float(right @ solution) + determinant - log_normal)
 
     def solve(
-        self, patterns: FloatArray, prior: FieldPrior, film_groups: Sequence[int] | None, with_covariance: bool
+        self, basis: FieldBasis, prior: FieldPrior, film_groups: Sequence[int] | None, with_covariance: bool
     ) -> _Solved:
-        normal, right, _ = self._with_priors(patterns, prior, film_groups, range(self.images))
+        normal, right, _ = self._with_priors(basis, prior, film_groups, range(self.images))
         factor, scale = _factor(normal)
         found = (scale * cho_solve(factor, scale * right)).reshape(self.images, -1)
-        weights = found[:, CAMERA:].reshape(self.images, -1, 2)
+        weights = found[:, self.unknowns :].reshape(self.images, -1, 2)
         covariance = _inverse(factor[0], scale) if with_covariance else np.empty((0, 0))
-        return _Solved(found[:, :CAMERA], weights, covariance, -float(right @ found.ravel()))
+        return _Solved(found[:, : self.unknowns], weights, covariance, -float(right @ found.ravel()))
 
-    def movement(self, solved: _Solved, cameras: Sequence[PanoramicCamera], patterns: FloatArray) -> float:
+    def movement(self, solved: _Solved, cameras: Sequence[PanoramicCamera], basis: FieldBasis) -> float:
         """Rms movement of the observations by a solution, in standard deviations."""
         steps = []
-        for camera, change, weights in zip(cameras, solved.parameters, solved.pattern_weights, strict=True):
-            field = patterns @ weights - _field_of(camera).coefficients.reshape(-1, 2)
-            steps.append(np.append(change, field))
+        for image, camera in enumerate(cameras):
+            field = basis.amounts(image, solved.pattern_weights[image])
+            field[: _field_of(camera).functions] -= _field_of(camera).amounts
+            steps.append(np.append(solved.parameters[image], field))
         square = count = 0.0
         for group in self.groups:
             step = np.concatenate([steps[image] for image in group.images])
@@ -487,25 +590,28 @@ class _Block:
         return float(np.sqrt(square / count))
 
     def scales_after(
-        self, solved: _Solved, rows: Sequence[Rows], weights: Sequence[FloatArray], patterns: FloatArray
+        self, solved: _Solved, rows: Sequence[Rows], weights: Sequence[FloatArray], basis: FieldBasis
     ) -> dict[str, float]:
         """Variance components: by how much the residuals of each kind exceed their sigmas.
 
         Where residuals of a cell of film are alike, their mean says less than its points: the scale is the larger one
         of that of single points and that of cells.
         """
-        width = CAMERA + 2 * patterns.shape[1]
+        width = self.unknowns + 2 * basis.count
         square = dict.fromkeys(KINDS, BELIEF_IN_SIGMAS)
         redundancy = dict.fromkeys(KINDS, BELIEF_IN_SIGMAS)
         of_cells: dict[str, list[FloatArray]] = {kind: [] for kind in KINDS}
         for group, equations, weight in zip(self.groups, rows, weights, strict=True):
             columns = np.concatenate([np.arange(width) + width * image for image in group.images])
-            taken = float((group.of_patterns(patterns)[0] * solved.covariance[np.ix_(columns, columns)]).sum())
+            taken = float((group.of_patterns(basis)[0] * solved.covariance[np.ix_(columns, columns)]).sum())
             used = weight > 0
             residuals = equations.residuals[used]
             square[group.kind] += float((weight[used, None] * residuals**2).sum())
             redundancy[group.kind] += residuals.size - taken / self.scales[group.kind] ** 2
             of_cells[group.kind].append(_cell_sums(equations, weight))
+        steps = _step_columns(self.images, width, basis)
+        square["step"] += float((solved.pattern_weights[:, basis.smooth :] ** 2).sum())
+        redundancy["step"] += float((1.0 - solved.covariance[steps, steps] / self.scales["step"] ** 2).sum())
         scales = {}
         for kind in KINDS:
             variance = square[kind] / max(redundancy[kind], 1.0)
@@ -562,7 +668,7 @@ def _result(
     weights: list[FloatArray],
     scales: dict[str, float],
     prior: FieldPrior,
-    patterns: FloatArray,
+    basis: FieldBasis,
     block: _Block,
     solved: _Solved,
     iterations: int,
@@ -570,12 +676,12 @@ def _result(
     used = sum(int((weight > 0).sum()) * group.residuals.shape[1] for group, weight in zip(rows, weights, strict=True))
     taken = 0.0
     variances = []
+    fields = [_field_of(camera) for camera in cameras]
     for group, equations in zip(block.groups, rows, strict=True):
-        variance = computed_variances(equations, solved.covariance, patterns, _field_of(cameras[0]))
-        variances.append(variance)
-        width = CAMERA + 2 * patterns.shape[1]
+        variances.append(computed_variances(equations, solved.covariance, basis, fields))
+        width = block.unknowns + 2 * basis.count
         columns = np.concatenate([np.arange(width) + width * image for image in group.images])
-        share = (group.of_patterns(patterns)[0] * solved.covariance[np.ix_(columns, columns)]).sum()
+        share = (group.of_patterns(basis)[0] * solved.covariance[np.ix_(columns, columns)]).sum()
         taken += float(share) / scales[group.kind] ** 2
     return Calibration(
         cameras=tuple(cameras),
@@ -584,7 +690,8 @@ def _result(
         variances=tuple(variances),
         scales=scales,
         prior=prior,
-        patterns=patterns,
+        basis=basis,
+        pattern_weights=solved.pattern_weights,
         covariance=solved.covariance,
         redundancy=used - taken,
         cost=solved.cost,
@@ -593,33 +700,39 @@ def _result(
     )
 
 
-def computed_variances(rows: Rows, covariance: FloatArray, patterns: FloatArray, field: FilmField) -> FloatArray:
+def computed_variances(
+    rows: Rows, covariance: FloatArray, basis: FieldBasis, fields: Sequence[FilmField]
+) -> FloatArray:
     """Variances (M, K) of what equations compute, from the covariance of cameras and patterns of all images."""
-    by_pattern = np.kron(patterns, np.eye(2))
-    width = CAMERA + by_pattern.shape[1]
+    by_camera = rows.by_camera()
+    unknowns = by_camera.shape[-1]
+    width = unknowns + 2 * basis.count
     columns = np.concatenate([np.arange(width) + width * image for image in rows.images])
-    mine = covariance[np.ix_(columns, columns)].reshape(len(rows.images), width, len(rows.images), width)
-    # Back from patterns to splines, so that a row touches few of them.
-    left = np.concatenate([mine[:, :CAMERA], _left(by_pattern.T, mine[:, CAMERA:])], axis=1)
-    whole = np.concatenate([left[..., :CAMERA], left[..., CAMERA:] @ by_pattern.T], axis=-1)
-    splines, values = spline_values(rows, field)
+    # Back from patterns to functions, so that a row touches few of them.
+    whole = _in_other_unknowns(
+        covariance[np.ix_(columns, columns)], unknowns, [basis.by_component[image].T for image in rows.images]
+    )
     variance = np.empty(rows.by_film.shape[:2])
-    size = len(rows.images) * (CAMERA + len(by_pattern))
     kernels.variances(
         rows.by_film,
-        rows.by_camera(),
-        splines,
-        values,
-        CAMERA + len(by_pattern),
-        np.ascontiguousarray(whole.reshape(size, size)),
+        by_camera,
+        *function_values(rows, fields),
+        unknowns + 2 * basis.functions,
+        whole,
         variance,
     )
     return variance
 
 
-def _camera_columns(images: int, normal: FloatArray) -> IntArray:
-    width = len(normal) // images
-    return np.asarray((width * np.arange(images)[:, None] + np.arange(CAMERA)).ravel())
+def _camera_columns(images: int, width: int, of_field: int) -> IntArray:
+    """Which unknowns are those of cameras, where every image has so many and the last ones are its field's."""
+    return np.asarray((width * np.arange(images)[:, None] + np.arange(width - of_field)).ravel())
+
+
+def _step_columns(images: int, width: int, basis: FieldBasis) -> IntArray:
+    """Which unknowns are weights of patterns that move pieces of film; they come last of an image."""
+    last = width * np.arange(1, images + 1)[:, None]
+    return np.asarray((last - 2 * (basis.count - basis.smooth) + np.arange(2 * (basis.count - basis.smooth))).ravel())
 
 
 def _factor(normal: FloatArray) -> tuple[tuple[FloatArray, bool], FloatArray]:

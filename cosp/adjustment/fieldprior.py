@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
 import numpy as np
 
 from cosp.arrays import FloatArray
-from cosp.camera.field import FilmField
+from cosp.camera.field import FilmField, FilmSteps
 
 # Correlation across the film over that along it: distortion simulated at 60 by 40 mm explains published residuals.
 WIDTH_OVER_LENGTH = 2.0 / 3.0
@@ -14,6 +18,126 @@ SMALLEST_MODE = 1e-4  # of the largest variance; smaller ones are left out: toge
 EXPECTED_AMPLITUDE_MM = 0.01
 AMPLITUDE_SPREAD = np.log(3.0)
 AMPLITUDES_MM = np.geomspace(1e-4, 0.1, 61)
+# Width over which pieces of film pass into each other: that of the band in which the pictures of two parts are blended.
+PASSAGE_MM = 3.0
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Where pieces of one film meet, and how far off they may lie.
+
+    Parameters
+    ----------
+    x_mm : tuple of floats
+        Rising.
+    steps_mm : tuple of floats
+        Standard deviation of the step at each of them, per axis and edge of the film, that all pieces beyond share:
+        parts are laid down one after the other.
+    pieces_mm : float
+        Standard deviation of each piece by itself: the scanner sets down its blocks independently.
+    """
+
+    x_mm: tuple[float, ...] = ()
+    steps_mm: tuple[float, ...] = ()
+    pieces_mm: float = 0.0
+
+    def root(self) -> FloatArray:
+        """Patterns (pieces, Q) whose independent unit sums are the displacements of the pieces, mm."""
+        pieces = len(self.x_mm) + 1
+        beyond = np.tril(np.ones((pieces, len(self.x_mm))), -1) * self.steps_mm
+        # What moves the whole film is the camera's.
+        both = np.hstack([beyond - beyond.mean(axis=0, keepdims=True), self.pieces_mm * np.eye(pieces)])
+        values, vectors = np.linalg.eigh(both @ both.T)
+        kept = values > 1e-9 * max(values.max(), 1e-12)
+        return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def joints_on_film(
+    joints_mm: Sequence[float],
+    limits_mm: Sequence[float],
+    *,
+    half_length_mm: float,
+    joint_sigma_mm: float,
+    limit_sigma_mm: float,
+) -> Joints:
+    """Joints of the parts of a film and limits of the scanner's blocks that lie on its format.
+
+    Of two that are nearer to each other than pieces need to pass into each other one is kept, a joint of parts first.
+
+    Parameters
+    ----------
+    joints_mm, limits_mm : sequences of float
+        Where they lie, x.
+    half_length_mm : float
+    joint_sigma_mm, limit_sigma_mm : float
+        Standard deviations of the step at a joint and of a block by itself; 0: there are none such.
+    """
+    found: list[tuple[float, float]] = []
+    for places, step, sigma in ((joints_mm, joint_sigma_mm, joint_sigma_mm), (limits_mm, 0.0, limit_sigma_mm)):
+        for x in sorted(places) if sigma > 0.0 else ():
+            apart = all(abs(x - other) >= PASSAGE_MM for other, _ in found)
+            if abs(x) < half_length_mm - PASSAGE_MM and apart:
+                found.append((float(x), step))
+    blocks = any(step == 0.0 for _, step in found)
+    x_mm, steps_mm = zip(*sorted(found), strict=True) if found else ((), ())
+    return Joints(x_mm, steps_mm, limit_sigma_mm if blocks else 0.0)
+
+
+@dataclass(frozen=True)
+class FieldBasis:
+    """Patterns that the fields of all films of a block are sums of.
+
+    Parameters
+    ----------
+    patterns : tuple of (F, K) arrays
+        Of each film: how much of each function of its field is in a pattern, the same for both components.
+    smooth : int
+        How many of the patterns are those of the smooth process; the others move pieces of film and have unit variance.
+    """
+
+    patterns: tuple[FloatArray, ...]
+    smooth: int
+
+    @classmethod
+    def of(cls, fields: Sequence[FilmField], joints: Sequence[Joints], length_mm: float) -> FieldBasis:
+        """Patterns for a correlation length; films with fewer pieces than others have patterns that do nothing."""
+        waves = modes(replace(fields[0], steps=None), length_mm)
+        # Both edges of a piece move by themselves.
+        moves = [np.kron(own.root(), np.eye(2)) for own in joints]
+        rows = max((field.functions for field in fields), default=0)
+        columns = waves.shape[1] + max(move.shape[1] for move in moves)
+        patterns = []
+        for field, move in zip(fields, moves, strict=True):
+            pattern = np.zeros((rows, columns))
+            pattern[: len(waves), : waves.shape[1]] = waves
+            if field.steps is not None:
+                pattern[len(waves) : field.functions, waves.shape[1] : waves.shape[1] + move.shape[1]] = move
+            patterns.append(pattern)
+        return cls(tuple(patterns), waves.shape[1])
+
+    @property
+    def functions(self) -> int:
+        """Number of functions of a field."""
+        return int(self.patterns[0].shape[0])
+
+    @property
+    def count(self) -> int:
+        """Number of patterns."""
+        return int(self.patterns[0].shape[1])
+
+    @cached_property
+    def by_component(self) -> tuple[FloatArray, ...]:
+        """The patterns for amounts along and across in turns, (2 F, 2 K) for each film."""
+        return tuple(np.kron(pattern, np.eye(2)) for pattern in self.patterns)
+
+    def amounts(self, image: int, weights: FloatArray) -> FloatArray:
+        """Amounts (F, 2) of the functions of a film's field from the weights (K, 2) of its patterns."""
+        return np.asarray(self.patterns[image] @ weights)
+
+
+def field_with_pieces(flat: FilmField, joints: Joints) -> FilmField:
+    """A field without displacement for a film with joints."""
+    return replace(flat, steps=FilmSteps.none_at(joints.x_mm, width_mm=PASSAGE_MM)) if joints.x_mm else flat
 
 
 def modes(field: FilmField, length_mm: float) -> FloatArray:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from cosp.adjustment.bundle import PARAMETERS
-from cosp.adjustment.calibration import Calibration, computed_variances
+from cosp.adjustment.calibration import Calibration
 from cosp.adjustment.observations import Ties
-from cosp.adjustment.rows import Rows, ground_by_film, intersections
+from cosp.adjustment.rows import Rows, camera_derivatives, ground_by_film, intersections
 from cosp.arrays import FloatArray
-from cosp.camera.derivatives import film_derivatives
 from cosp.camera.panoramic import PanoramicCamera
 
 
@@ -53,7 +52,7 @@ class HeightSigma:
 
 
 def height_sigma(
-    cameras: tuple[PanoramicCamera, ...],
+    cameras: Sequence[PanoramicCamera],
     first: int,
     second: int,
     *,
@@ -68,12 +67,12 @@ def height_sigma(
 
     Parameters
     ----------
-    cameras : tuple of PanoramicCamera
-        Adjusted.
+    cameras : sequence of PanoramicCamera
+        All of the block, adjusted.
     first, second : int
         Images of the pair.
-    covariance : (13 n, 13 n) array
-        Of the camera parameters; used where there is no calibration.
+    covariance : (P n, P n) array
+        Of the unknowns of the cameras; used where there is no calibration.
     calibration : Calibration or None
         Its covariance of cameras and film fields is used instead.
     film_sigma_mm : float
@@ -95,7 +94,7 @@ def height_sigma(
     with np.errstate(invalid="ignore"):
         inside = (np.abs(seen) <= [other.half_length_mm, other.half_width_mm]).all(axis=1)
     pair = Ties(first, second, film[inside], seen[inside], np.ones(int(inside.sum())))
-    at = intersections(cameras, pair)
+    at = intersections(cameras, pair, len(covariance) // len(cameras))
     # Up in the local frame is up on the ellipsoid to within a degree: nothing to a standard deviation.
     by_film = ground_by_film(at.film_by_ground)[:, 2]
     rows = Rows(
@@ -106,29 +105,37 @@ def height_sigma(
         film_by_camera=at.film_by_camera,
         imaged_mm=at.imaged_mm,
     )
-    variance = _variances(rows, camera, covariance, calibration)[:, 0]
+    variance = _variances(rows, covariance, calibration)[:, 0]
     sigma = np.full(len(film), np.nan)
     sigma[inside] = np.sqrt(variance + film_sigma_mm**2 * (by_film**2).sum(axis=1) + reference_sigma_m**2)
     return HeightSigma(camera.scene, x, y, _continued(sigma.reshape(len(y), len(x))), height_m)
 
 
 def place_sigma_m(
-    camera: PanoramicCamera, image: int, *, covariance: FloatArray, calibration: Calibration | None, height_m: float
+    cameras: Sequence[PanoramicCamera],
+    image: int,
+    *,
+    covariance: FloatArray,
+    calibration: Calibration | None,
+    height_m: float,
 ) -> tuple[float, float]:
     """Standard deviations east and north of where film points lie at a known height, root mean square over the film.
 
     Parameters
     ----------
-    camera : PanoramicCamera
-        Adjusted.
+    cameras : sequence of PanoramicCamera
+        All of the block, adjusted.
     image : int
-        Its place in the block.
+        Which of them.
     covariance, calibration, height_m
         As for `height_sigma`.
     """
+    camera = cameras[image]
     x, y = (np.linspace(-half, half, count) for half, count in ((camera.half_length_mm, 21), (camera.half_width_mm, 5)))
     film = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    by_camera, by_ground = film_derivatives(camera, camera.locate(film, height_m), film)
+    by_camera, by_ground = camera_derivatives(
+        camera, camera.locate(film, height_m), film, len(covariance) // len(cameras)
+    )
     rows = Rows(
         kind="gcp",
         images=(image,),
@@ -137,18 +144,18 @@ def place_sigma_m(
         film_by_camera=by_camera[:, None],
         imaged_mm=camera.imaged(film)[:, None],
     )
-    east, north = np.sqrt(_variances(rows, camera, covariance, calibration).mean(axis=0))
+    east, north = np.sqrt(_variances(rows, covariance, calibration).mean(axis=0))
     return float(east), float(north)
 
 
-def _variances(
-    rows: Rows, camera: PanoramicCamera, covariance: FloatArray, calibration: Calibration | None
-) -> FloatArray:
+def _variances(rows: Rows, covariance: FloatArray, calibration: Calibration | None) -> FloatArray:
     """Variances (M, K) of what rows compute, from the calibration if there is one."""
-    if calibration is not None and camera.film_field is not None:
-        return computed_variances(rows, calibration.covariance, calibration.patterns, camera.film_field)
-    jacobian = rows.by_camera().reshape(*rows.residuals.shape, PARAMETERS * len(rows.images))
-    columns = np.concatenate([np.arange(PARAMETERS) + PARAMETERS * image for image in rows.images])
+    if calibration is not None:
+        return calibration.variances_of(rows)
+    by_camera = rows.by_camera()
+    width = by_camera.shape[-1]
+    jacobian = by_camera.reshape(*rows.residuals.shape, width * len(rows.images))
+    columns = np.concatenate([np.arange(width) + width * image for image in rows.images])
     return np.asarray(np.einsum("nka,ab,nkb->nk", jacobian, covariance[np.ix_(columns, columns)], jacobian))
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cosp.adjustment.bundle import PARAMETERS, Adjustment
+from cosp.adjustment.bundle import Adjustment
 from cosp.adjustment.observations import Control, Ties
 from cosp.adjustment.rows import Rows, control_rows, intersections, tie_rows
+from cosp.adjustment.unknowns import NAMES
 from cosp.arrays import BoolArray, FloatArray
-from cosp.camera.derivatives import PARAMETER_NAMES
 from cosp.camera.missions import GROUND_SPEED_KM_PER_SCAN, TILT_DEG
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.rays import meet
@@ -136,16 +136,50 @@ def group_statistics(
     return found
 
 
+def belief_statistics(
+    kind: str, residuals: FloatArray, variances: FloatArray, scale: float = 1.0
+) -> dict[str, Any] | None:
+    """The same for what was believed of unknowns before anything was measured; None where there are no such unknowns.
+
+    Parameters
+    ----------
+    kind : str
+    residuals : (N,) array
+        Unknowns minus what was believed, over its standard deviations.
+    variances : (N,) array
+        Of the unknowns, in the same units.
+    scale : float
+        By how much the standard deviations were scaled.
+    """
+    # What no observation touches keeps its belief and says nothing.
+    free = scale**2 - variances
+    told = free > 1e-6 * scale**2
+    if not told.any():
+        return None
+    size = np.abs(residuals[told]) / np.sqrt(free[told])
+    redundancy = float(free[told].sum()) / scale**2
+    return {
+        "kind": kind,
+        "count": int(told.sum()),
+        "rejected": 0,
+        "sigma_naught": math.sqrt(float((residuals[told] ** 2).sum()) / redundancy),
+        "sigmas_scaled_by": scale,
+        "redundancy": redundancy,
+        "w_tests": {"limit": BAARDA_LIMIT, "tested": size.size, "beyond": int((size > BAARDA_LIMIT).sum())},
+    }
+
+
 def plain_groups(
     adjustment: Adjustment, control: Sequence[Control], ties: Sequence[Ties]
 ) -> tuple[list[Rows], list[FloatArray], list[FloatArray]]:
     """Equations, weights and variances of what is computed, of an adjustment without film fields."""
-    rows = [control_rows(adjustment.cameras[i], points, i) for i, points in enumerate(control)]
-    rows += [tie_rows(intersections(adjustment.cameras, points), points) for points in ties]
+    width = adjustment.unknowns
+    rows = [control_rows(adjustment.cameras[i], points, i, width) for i, points in enumerate(control)]
+    rows += [tie_rows(intersections(adjustment.cameras, points, width), points) for points in ties]
     variances = []
     for group in rows:
-        jacobian = group.by_camera().reshape(*group.residuals.shape, PARAMETERS * len(group.images))
-        columns = np.concatenate([np.arange(PARAMETERS) + PARAMETERS * image for image in group.images])
+        jacobian = group.by_camera().reshape(*group.residuals.shape, width * len(group.images))
+        columns = np.concatenate([np.arange(width) + width * image for image in group.images])
         variances.append(
             np.einsum("mka,ab,mkb->mk", jacobian, adjustment.covariance[np.ix_(columns, columns)], jacobian)
         )
@@ -153,18 +187,19 @@ def plain_groups(
 
 
 def correlations(adjustment: Adjustment, limit: float) -> list[list[dict[str, Any]]]:
-    """Pairs of parameters correlated beyond a limit, a list per image, strongest first."""
+    """Pairs of unknowns correlated beyond a limit, a list per image, strongest first; all those of a focal length."""
     found = []
+    width = adjustment.unknowns
     for i in range(len(adjustment.cameras)):
-        block = slice(PARAMETERS * i, PARAMETERS * (i + 1))
+        block = slice(width * i, width * (i + 1))
         covariance = adjustment.covariance[block, block]
         sigma = np.sqrt(np.diag(covariance))
         correlation = covariance / sigma[:, None] / sigma
         pairs = [
-            {"first": PARAMETER_NAMES[a], "second": PARAMETER_NAMES[b], "correlation": float(correlation[a, b])}
-            for a in range(PARAMETERS)
-            for b in range(a + 1, PARAMETERS)
-            if abs(correlation[a, b]) > limit
+            {"first": NAMES[a], "second": NAMES[b], "correlation": float(correlation[a, b])}
+            for a in range(width)
+            for b in range(a + 1, width)
+            if abs(correlation[a, b]) > limit or NAMES[b] == "f"
         ]
         found.append(sorted(pairs, key=_strength, reverse=True))
     return found

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosp.adjustment.observations import Control, HeightReference, Ties
+from cosp.adjustment.unknowns import PARAMETERS
 from cosp.arrays import FloatArray
-from cosp.camera.derivatives import film_derivatives
+from cosp.camera.derivatives import film_derivatives, focal_derivatives
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.rays import meet
 
@@ -33,8 +34,8 @@ class Rows:
         Observed minus computed; the K residuals of a row share one robust weight. NaN rows count for nothing.
     by_film : (M, K, I, 2) array
         Derivatives of the computed values with respect to displacements on the films, per mm.
-    film_by_camera : (M, I, 2, 13) array
-        Derivatives of the film points with respect to the 13 parameters of their cameras.
+    film_by_camera : (M, I, 2, P) array
+        Derivatives of the film points with respect to the P unknowns of their cameras.
     imaged_mm : (M, I, 2) array
         Film points as the cameras image them, where distortion is to be looked up.
     """
@@ -47,7 +48,7 @@ class Rows:
     imaged_mm: FloatArray
 
     def by_camera(self) -> FloatArray:
-        """Derivatives of the computed values with respect to the camera parameters, (M, K, I, 13)."""
+        """Derivatives of the computed values with respect to the unknowns of the cameras, (M, K, I, P)."""
         return np.asarray(np.swapaxes(np.swapaxes(self.by_film, 1, 2) @ self.film_by_camera, 1, 2))
 
 
@@ -60,7 +61,7 @@ class Intersections:
     ground_m : (N, 3) array
     misfit_mm : (N, 2, 2) array
         Measured minus computed film points, per image.
-    film_by_camera : (N, 2, 2, 13) array
+    film_by_camera : (N, 2, 2, P) array
     film_by_ground : (N, 2, 2, 3) array
     imaged_mm : (N, 2, 2) array
     """
@@ -72,10 +73,20 @@ class Intersections:
     imaged_mm: FloatArray
 
 
-def control_rows(camera: PanoramicCamera, control: Control, image: int = 0) -> Rows:
+def camera_derivatives(
+    camera: PanoramicCamera, ground_m: FloatArray, film_mm: FloatArray, unknowns: int = PARAMETERS
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of film points by the 13 or 14 unknowns of their camera (N, 2, P), and by ground points (N, 2, 3)."""
+    by_camera, by_ground = film_derivatives(camera, ground_m, film_mm)
+    if unknowns > PARAMETERS:
+        by_camera = np.concatenate([by_camera, focal_derivatives(camera, film_mm)[..., None]], axis=-1)
+    return by_camera, by_ground
+
+
+def control_rows(camera: PanoramicCamera, control: Control, image: int = 0, unknowns: int = PARAMETERS) -> Rows:
     """Two equations per control point; the covariance of its ground point is carried into the film."""
     film = camera.project(control.ground_m)
-    by_camera, by_ground = film_derivatives(camera, control.ground_m, film)
+    by_camera, by_ground = camera_derivatives(camera, control.ground_m, film, unknowns)
     variance = np.stack([control.sigma_ground_m**2, control.sigma_ground_m**2, control.sigma_height_m**2], axis=1)
     covariance = np.einsum("nik,nk,njk->nij", by_ground, variance, by_ground)
     covariance[:, [0, 1], [0, 1]] += control.sigma_mm[:, None] ** 2
@@ -90,14 +101,14 @@ def control_rows(camera: PanoramicCamera, control: Control, image: int = 0) -> R
     )
 
 
-def intersections(cameras: Sequence[PanoramicCamera], ties: Ties) -> Intersections:
+def intersections(cameras: Sequence[PanoramicCamera], ties: Ties, unknowns: int = PARAMETERS) -> Intersections:
     """Ground points of tie points under the present cameras, and how the film points follow them."""
     sides = ((cameras[ties.first], ties.first_mm), (cameras[ties.second], ties.second_mm))
     ground, _ = meet(*(camera.rays(film) for camera, film in sides))
     parts = []
     for camera, observed in sides:
         film = camera.project(ground)
-        parts.append((observed - film, *film_derivatives(camera, ground, film), camera.imaged(film)))
+        parts.append((observed - film, *camera_derivatives(camera, ground, film, unknowns), camera.imaged(film)))
     misfit, by_camera, by_ground, imaged = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
     return Intersections(ground, misfit, by_camera, by_ground, imaged)
 

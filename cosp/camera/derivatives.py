@@ -84,6 +84,19 @@ def film_derivatives(
     return by_all[:, :, :13], by_all[:, :, 13:]
 
 
+def focal_derivatives(camera: PanoramicCamera, film_mm: FloatArray) -> FloatArray:
+    """Derivatives (N, 2) of film points (N, 2) with respect to the focal length.
+
+    A longer lens images everything on a larger scale and nothing else: the time at which a point is exposed follows the
+    scan angle, whatever the length of film that the sweep covers.
+    """
+    imaged_mm = camera.imaged(film_mm)
+    by_focal = imaged_mm / camera.focal_length_mm
+    if camera.film_field is None:
+        return by_focal
+    return np.asarray(by_focal + (camera.film_field.gradient(imaged_mm) @ by_focal[..., None])[..., 0])
+
+
 def _by_angles(angles: FloatArray, rotation: FloatArray, from_centre: FloatArray, n: FloatArray) -> FloatArray:
     """Derivatives of R d with respect to omega, phi and kappa, (N, 3, 3) with the angle last."""
     # Omega turns first, about the world's x axis: dR/d(omega) d = R (dz ey - dy ez) = R (0, dz, -dy).

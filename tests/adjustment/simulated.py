@@ -44,6 +44,26 @@ class SteppedFilm:
         return self.smooth(film_mm) + self.offset_mm[block]
 
 
+# Where parts of the two films were joined; on the ground some of the places nearly agree.
+JOINTS_MM = ((-183.0, 4.0, 190.0), (-178.0, -9.0, 186.0))
+
+
+class JoinedFilm:
+    """Film in four parts that were laid down off their places, besides its smooth distortion."""
+
+    def __init__(self, rng, smooth, joints_mm, step_px):
+        self.smooth = smooth
+        self.joints_mm = np.asarray(joints_mm)
+        # Of both edges of the film: each part is shifted and turned a little against the one before it.
+        self.steps_mm = rng.normal(0.0, step_px * PIXEL_MM, (len(joints_mm), 2, 2))
+
+    def __call__(self, film_mm):
+        offsets = np.concatenate([np.zeros((1, 2, 2)), np.cumsum(self.steps_mm, axis=0)])
+        offsets = offsets[np.searchsorted(self.joints_mm, film_mm[..., 0])]
+        share = (film_mm[..., 1:] + HALF_WIDTH_MM) / (2.0 * HALF_WIDTH_MM)
+        return self.smooth(film_mm) + (1.0 - share) * offsets[..., 0, :] + share * offsets[..., 1, :]
+
+
 def terrain_m(ground):
     """Ellipsoidal heights, 700 m about 1500 m."""
     east, north = ground[..., 0], ground[..., 1]
@@ -114,6 +134,7 @@ def simulate_pair(
     pixel_mm=PIXEL_MM,
     cameras=None,
     step_px=0.0,
+    joint_px=0.0,
 ):
     """Observations of a pair; every other block of 60 x 27 mm of film is held out as check points.
 
@@ -124,6 +145,10 @@ def simulate_pair(
     distortions = (FilmDistortion(rng, distortion_px), FilmDistortion(rng, distortion_px))
     if step_px:
         distortions = tuple(SteppedFilm(rng, smooth, step_px) for smooth in distortions)
+    if joint_px:
+        distortions = tuple(
+            JoinedFilm(rng, smooth, joints, joint_px) for smooth, joints in zip(distortions, JOINTS_MM, strict=True)
+        )
     control, checks, gross = [], [], []
     for camera, distortion in zip(cameras, distortions, strict=True):
         film = film_sample(rng, gcps)

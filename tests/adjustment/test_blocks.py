@@ -12,9 +12,12 @@ from cosp.adjustment import blocks, precision
 from cosp.adjustment.observations import PLAIN_PRIORS
 from cosp.adjustment.posterior import HeightSigma
 from cosp.camera.panoramic import PanoramicCamera
+from cosp.film.joining import Layout
+from cosp.film.scanner import Blocks, Steps
 from cosp.geometry.grids import PixelGrid
+from cosp.geometry.transforms import Rigid
 from cosp.io import rasters, records, tables
-from scripts.adjust_bundle import adjust_bundle
+from scripts.adjust_bundle import adjust_bundle, film_joints
 from scripts.predict_camera import predict_camera
 from tests.adjustment.simulated import GROUND_M, HEIGHT_M, MATCH_PX, TIE_PX, SimulatedPair, simulate_pair, terrain_m
 from tests.authorities.parameter_table import PIXEL_MM
@@ -148,15 +151,57 @@ class Run:
         ]
 
 
+EXPOSURE = {"pixel_mm": PIXEL_MM, "centre_px": [50_000.0, 4000.0]}
+
+
+def seams_record(blocks=None):
+    """Four parts of a film, joined at -180.25, 0 and 180.25 mm of its digitised image."""
+    layout = Layout(
+        motions=tuple(Rigid(0.0, (24_000.0 * part, 0.0)) for part in range(4)),
+        steps=(Steps(),) * 4,
+        greys=((1.0, 0.0),) * 4,
+        joints_px=(24_250.0, 50_000.0, 75_750.0),
+        feathers_px=(280.0,) * 3,
+        shape=(8000, 100_000),
+    )
+    return {"kind": "seams", "version": 1, "pixel_mm": PIXEL_MM, "scanner_blocks": blocks, "layout": layout}
+
+
+def test_joints_lie_where_the_record_of_the_parts_says(tmp_path):
+    camera = simulate_pair(np.random.default_rng(0), gcps=10, ties=10).cameras[0]
+    film = {"pixel_mm": PIXEL_MM, "turned": False, "exposure": EXPOSURE}
+    records.write(tmp_path / "seams.json", seams_record())
+    upright = film_joints(tmp_path / "seams.json", film, camera, 0.3, 0.1)
+    np.testing.assert_allclose(upright.x_mm, [-180.25, 0.0, 180.25])
+    np.testing.assert_allclose(upright.steps_mm, 0.3 * PIXEL_MM)
+    assert upright.pieces_mm == 0.0
+    # Blocks of 40 mm in parts one and four, which begin at 5 and 10 mm of their part; part four begins at 154 mm.
+    records.write(tmp_path / "blocks.json", seams_record(Blocks(40.0, (5.0, None, None, 10.0))))
+    turned = film_joints(tmp_path / "blocks.json", film | {"turned": True}, camera, 0.3, 0.1)
+    first = -350.0 + np.arange(5.0, 168.0, 40.0)
+    last = np.arange(154.0 + 10.0, camera.half_length_mm - 3.0, 40.0)
+    expected = [*first, -180.25, 0.0, 180.25, *last[last > 180.25]]
+    np.testing.assert_allclose(turned.x_mm, -np.array(expected)[::-1], atol=1e-9)
+    assert np.count_nonzero(turned.steps_mm) == 3
+    assert turned.pieces_mm == pytest.approx(0.1 * PIXEL_MM)
+    assert film_joints(tmp_path / "blocks.json", film, camera, 0.0, 0.0).x_mm == ()
+
+
 def run_script(folder, model):
     """Write the script's input for a simulated pair, and run it."""
     distortion_px = {"plain": 0.0, "field": 1.5}[model]
     simulated = simulate_pair(np.random.default_rng(3), gcps=800, ties=2000, distortion_px=distortion_px)
     scenes = [camera.scene for camera in simulated.cameras]
-    for camera, control, checks in zip(simulated.start(), simulated.control, simulated.checks, strict=True):
+    starts = simulated.start()
+    aft = starts[1]
+    for camera, control, checks in zip(starts, simulated.control, simulated.checks, strict=True):
         tables.write(folder / f"{camera.scene}.parquet", gcp_table(camera, control, checks))
         (folder / f"{camera.scene}_footprint.json").write_text(json.dumps({"camera": records.as_plain(camera)}))
-        records.write(folder / f"{camera.scene}_film.json", {"kind": "film", "version": 1, "pixel_mm": PIXEL_MM})
+        records.write(
+            folder / f"{camera.scene}_film.json",
+            {"kind": "film", "version": 1, "pixel_mm": PIXEL_MM, "turned": camera is aft, "exposure": EXPOSURE},
+        )
+        records.write(folder / f"{camera.scene}_seams.json", seams_record())
     ties = simulated.ties
     tables.write(
         folder / "ties.parquet",
@@ -183,6 +228,7 @@ def run_script(folder, model):
         [],
         [folder / f"{scene}_footprint.json" for scene in scenes],
         [folder / f"{scene}_film.json" for scene in scenes],
+        [folder / f"{scene}_seams.json" for scene in scenes],
         folder / "dem.tif",
         None,
         folder / "cameras",
@@ -209,6 +255,10 @@ def run_script(folder, model):
         tie_distortion_um={"plain": 0.0, "field": 5.0}[model],
         gate_sigma=4.0,
         correlation_limit=0.9,
+        joint_sigma_px=0.3,
+        block_sigma_px=0.1,
+        focal_length="fixed",
+        focal_sigma_mm=1.0,
         grid_step_mm=10.0,
         grid_radius_mm=15.0,
     )
@@ -255,10 +305,14 @@ def test_the_summary_of_the_plain_model_holds_what_was_simulated(plain):
 def test_the_groups_of_observations_are_as_good_as_their_sigmas(plain, field):
     for each in (plain, field):
         groups = {group["kind"]: group for group in each.summary["groups"]}
-        assert set(groups) == ({"gcp", "tie", "dem"} if each.model == "field" else {"gcp", "tie"})
+        assert set(groups) == ({"gcp", "tie", "dem", "step"} if each.model == "field" else {"gcp", "tie"})
         for kind, group in groups.items():
             if kind == "dem":  # the reference of the test is exact, its sigma of 4 m is not
                 assert group["sigma_naught"] < 1.0
+                continue
+            if kind == "step":  # the films were joined without any
+                assert group["count"] == 24
+                assert group["w_tests"]["beyond"] == 0
                 continue
             assert 0.92 < group["sigma_naught"] < 1.06
             assert 0.8 * group["count"] < group["redundancy"] < 2.0 * group["count"]

@@ -137,7 +137,7 @@ def block_of(seed, pairs, ties, without):
         sigma = height_sigma(cameras, fore, aft, film_sigma_mm=0.0, step_mm=10.0, **of_it)
         numbers = " | ".join(f"{error:.2f}" for error in np.sqrt((errors**2).mean(axis=0)))
         ratio = np.sqrt(np.mean((errors[:, 2] / sigma.at(film)) ** 2))
-        east, north = place_sigma_m(cameras[fore], fore, **of_it)
+        east, north = place_sigma_m(cameras, fore, **of_it)
         print(f"| {pair_number + 1} | {numbers} | {ratio:.2f} | {east:.2f} {north:.2f} |", flush=True)
     memory_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     prior = found.calibration.prior
