@@ -53,17 +53,18 @@ def match_dense(
         least_uniqueness=least_uniqueness,
         largest_speckle_px=largest_speckle_px,
         speckle_step_px=speckle_step_px,
+        rows=(first - seen.row0, last - seen.row0),
         threads=threads,
     )
 
-    inside = wanted.inside(seen).slices
-    place = {"grid": header.grid.window(first, last, 0, columns), "crs": header.crs}
-    rasters.write(disparity_path, found.disparity[inside], **place, descriptions=("disparity",))
+    # Not compressed, as the strips are joined soon and then removed.
+    place = {"grid": header.grid.window(first, last, 0, columns), "crs": header.crs, "compressed": False}
+    rasters.write(disparity_path, found.disparity, **place, descriptions=("disparity",))
     with rasters.create(
         validity_path, shape=wanted.shape, dtype=np.uint8, **place, count=3, descriptions=VALIDITY_BANDS
     ) as validity_file:
         for band, values in enumerate((found.validity, found.confidence, found.similarity), start=1):
-            validity_file.write(None, values[inside], band)
+            validity_file.write(None, values, band)
 
 
 def smooth_y_parallax(y_parallax_path, fore_grid):

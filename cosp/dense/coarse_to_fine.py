@@ -21,7 +21,7 @@ from cosp.dense import kernels
 from cosp.dense.aggregation import aggregate_costs
 from cosp.dense.census import left_census, right_census
 from cosp.dense.memory import Workspace, workspace
-from cosp.dense.resampling import SmoothField, picture_pyramid, prior_of, resample_right
+from cosp.dense.resampling import CONTEXT_PX, SmoothField, picture_pyramid, prior_of, resample_right
 from cosp.dense.selection import DisparityMap, select_disparities
 from cosp.dense.validity import Validity, correlation, doubly_claimed, no_data, picture_validity, speckles, uniqueness
 from cosp.imaging.windows import Window, tiles
@@ -105,6 +105,7 @@ def match(
     speckle_step_px: float,
     threads: int,
     y_parallax: SmoothField | None = None,
+    rows: tuple[int, int] | None = None,
     tile_px: int = TILE_PX,
 ) -> DisparityMap:
     """Disparity of every pixel of the left picture that can be matched with confidence.
@@ -131,6 +132,14 @@ def match(
         Islands of up to so many pixels, cut off by steps of more than so much, are masked.
     y_parallax : SmoothField, px
         Right row minus left row by left pixel; taken out in the resampling that happens anyway.
+    rows : (first, last)
+        Rows of which the disparity is wanted, the last excluded. The coarser a level, the more of the rows around are
+        matched, too.
+
+    Returns
+    -------
+    DisparityMap
+        Of the rows wanted.
 
     References
     ----------
@@ -142,22 +151,28 @@ def match(
     if left.shape[0] != right.shape[0]:
         raise ValueError(f"pictures of {left.shape[0]} and {right.shape[0]} rows: the same number is needed")
     cv2.setNumThreads(1)
+    columns = left.shape[1]
+    wanted = Window(*(rows or (0, left.shape[0])), 0, columns)
+    # Claims and islands look around a pixel, too.
+    seen = wanted.grown(HALO_PX, left.shape)
     with ThreadPoolExecutor(threads) as pool:
         last = _coarse_to_fine(
             left,
             right,
             disparity_range_px,
             y_parallax or _NO_FIELD,
+            seen,
             small_step=small_step,
             large_step=large_step,
             tile_px=tile_px,
             pool=pool,
         )
-        result = DisparityMap(np.empty(left.shape, np.float32), *(np.empty(left.shape, np.uint8) for _ in range(3)))
+        result = DisparityMap(np.empty(seen.shape, np.float32), *(np.empty(seen.shape, np.uint8) for _ in range(3)))
 
         def finish(window: Window) -> None:
             grown = window.grown(HALO_PX, left.shape)
             inside = window.inside(grown).slices
+            target = window.inside(seen).slices
             with workspace() as memory:
                 tile = _cleaned(
                     last.left[grown.slices],
@@ -168,13 +183,13 @@ def match(
                     largest_speckle_px=largest_speckle_px,
                     speckle_step_px=speckle_step_px,
                 )
-                result.disparity[window.slices] = tile.disparity[inside]
-                result.validity[window.slices] = tile.validity[inside]
-                result.confidence[window.slices] = tile.confidence[inside]
-                result.similarity[window.slices] = tile.similarity[inside]
+                result.disparity[target] = tile.disparity[inside]
+                result.validity[target] = tile.validity[inside]
+                result.confidence[target] = tile.confidence[inside]
+                result.similarity[target] = tile.similarity[inside]
 
         _log.info("level 0: %d disparities", last.step.disparities)
-        _over_tiles(finish, left.shape, tile_px, pool)
+        _over_tiles(finish, seen, tile_px, pool)
         _settle_claims(
             result,
             right.shape[1],
@@ -182,7 +197,8 @@ def match(
             speckle_step_px=speckle_step_px,
             pool=pool,
         )
-    return result
+    part = wanted.inside(seen).slices
+    return DisparityMap(result.disparity[part], result.validity[part], result.confidence[part], result.similarity[part])
 
 
 def _coarse_to_fine(
@@ -190,6 +206,7 @@ def _coarse_to_fine(
     right: ByteArray,
     range_px: tuple[float, float],
     y_parallax: SmoothField,
+    wanted: Window,
     *,
     small_step: int,
     large_step: int,
@@ -202,9 +219,10 @@ def _coarse_to_fine(
     levels = passes[0].level
     lefts = picture_pyramid(np.ascontiguousarray(left), levels)
     rights = picture_pyramid(np.ascontiguousarray(right), levels)
+    needed = _needed(passes, wanted, [picture.shape for picture in lefts])
     found: Float32Array | None = None
     level = levels
-    for step in passes:
+    for step, window_needed in zip(passes, needed, strict=True):
         task = _Task(
             step,
             lefts[step.level],
@@ -219,7 +237,7 @@ def _coarse_to_fine(
         )
         if step is passes[-1]:
             break
-        coarse = np.empty(lefts[step.level].shape, np.float32)
+        coarse = np.full(lefts[step.level].shape, np.nan, np.float32)
 
         def keep(window: Window, task: _Task = task, coarse: Float32Array = coarse) -> None:
             grown = window.grown(HALO_PX, coarse.shape)
@@ -229,9 +247,21 @@ def _coarse_to_fine(
         _log.info("level %d: %d disparities", step.level, step.disparities)
         # The volume of a tile stays the same.
         size = tile_px if step.disparities == LEFT_OVER else 2 * tile_px // 3
-        _over_tiles(keep, coarse.shape, size, pool)
+        _over_tiles(keep, window_needed, size, pool)
         found, level = coarse, step.level
     return task
+
+
+def _needed(passes: list[Pass], wanted: Window, shapes: list[tuple[int, ...]]) -> list[Window]:
+    """What each pass has to match for the last one to know all that it looks at in the window wanted."""
+    windows = [wanted]
+    for finer, step in zip(passes[:0:-1], passes[-2::-1], strict=True):
+        ratio = 2 ** (step.level - finer.level)
+        window = windows[-1]
+        halved = Window(window.row0 // ratio, -(-window.row1 // ratio), 0, shapes[step.level][1])
+        # A tile's halo at the finer level, and what a prior looks at beyond.
+        windows.append(halved.grown(HALO_PX // ratio + CONTEXT_PX, shapes[step.level][:2]))
+    return windows[::-1]
 
 
 def _settle_claims(
@@ -245,6 +275,7 @@ def _settle_claims(
     """Take out the worse of two matches with the same right pixel, and the islands that this leaves, in place."""
     shape = result.disparity.shape
     claimed, left_over = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    whole = Window(0, shape[0], 0, shape[1])
     bands = (BAND_ROWS, shape[1])  # whole rows, since the two may lie tiles apart
 
     def claim(window: Window) -> None:
@@ -262,10 +293,10 @@ def _settle_claims(
             left_over[window.slices] = islands[window.inside(grown).slices]
 
     # Nothing is taken out before all have looked at their surroundings.
-    _over_tiles(claim, shape, bands, pool)
-    _over_tiles(lambda window: _take_out(result, claimed, window, Validity.INCONSISTENT), shape, bands, pool)
-    _over_tiles(clear, shape, BAND_ROWS, pool)
-    _over_tiles(lambda window: _take_out(result, left_over, window, Validity.SPECKLE), shape, bands, pool)
+    _over_tiles(claim, whole, bands, pool)
+    _over_tiles(lambda window: _take_out(result, claimed, window, Validity.INCONSISTENT), whole, bands, pool)
+    _over_tiles(clear, whole, BAND_ROWS, pool)
+    _over_tiles(lambda window: _take_out(result, left_over, window, Validity.SPECKLE), whole, bands, pool)
 
 
 def _take_out(result: DisparityMap, where: BoolArray, window: Window, reason: Validity) -> None:
@@ -276,10 +307,15 @@ def _take_out(result: DisparityMap, where: BoolArray, window: Window, reason: Va
 
 
 def _over_tiles(
-    work: Callable[[Window], None], shape: tuple[int, ...], size: int | tuple[int, int], pool: ThreadPoolExecutor
+    work: Callable[[Window], None], whole: Window, size: int | tuple[int, int], pool: ThreadPoolExecutor
 ) -> None:
-    """Do the work of every tile, so many at once; each writes to its own part of the result."""
-    windows = tiles((shape[0], shape[1]), size)
+    """Do the work of every tile of a window, so many at once; each writes to its own part of the result."""
+    windows = [
+        Window(
+            tile.row0 + whole.row0, tile.row1 + whole.row0, tile.column0 + whole.column0, tile.column1 + whole.column0
+        )
+        for tile in tiles(whole.shape, size)
+    ]
     for done, _ in enumerate(pool.map(work, windows), start=1):
         _log.debug("tile %d/%d", done, len(windows))
 

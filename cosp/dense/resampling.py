@@ -17,7 +17,8 @@ from cosp.imaging.windows import Window
 
 _log = logging.getLogger(__name__)
 
-_CONTEXT_PX = 8  # of the coarser level, that a prior looks beyond its window
+CONTEXT_PX = 8
+"""What a prior looks at of the level before beyond its window, px of that level."""
 
 
 @dataclass(frozen=True)
@@ -172,10 +173,10 @@ def prior_of(
     """
     ratio = 2 if finer else 1
     around = Window(
-        min(max(window.row0 // ratio - _CONTEXT_PX, 0), disparity.shape[0] - 1),
-        max(min(-(-window.row1 // ratio) + _CONTEXT_PX, disparity.shape[0]), 1),
-        min(max(window.column0 // ratio - _CONTEXT_PX, 0), disparity.shape[1] - 1),
-        max(min(-(-window.column1 // ratio) + _CONTEXT_PX, disparity.shape[1]), 1),
+        min(max(window.row0 // ratio - CONTEXT_PX, 0), disparity.shape[0] - 1),
+        max(min(-(-window.row1 // ratio) + CONTEXT_PX, disparity.shape[0]), 1),
+        min(max(window.column0 // ratio - CONTEXT_PX, 0), disparity.shape[1] - 1),
+        max(min(-(-window.column1 // ratio) + CONTEXT_PX, disparity.shape[1]), 1),
     )
     known = disparity[around.slices]
     if np.isnan(known).all():

@@ -126,6 +126,7 @@ def create(
     descriptions: Sequence[str] | None = None,
     tags: Mapping[str, str] | None = None,
     cog: bool = False,
+    compressed: bool = True,
 ) -> Iterator[RasterWriter]:
     """A raster to be written by windows; it appears under its name when all went well.
 
@@ -145,6 +146,8 @@ def create(
     tags : texts of the file, optional
     cog : bool
         Cloud-optimised, with overviews.
+    compressed : bool
+        Without loss. What is read once and then removed is handled several times quicker as it is.
 
     Yields
     ------
@@ -167,12 +170,11 @@ def create(
         "tiled": True,
         "blockxsize": _TILE,
         "blockysize": _TILE,
-        "compress": "zstd",
-        "zstd_level": 1,
-        "predictor": 3 if floating else 2,
         "interleave": "band",
         "bigtiff": "if_safer",
     }
+    if compressed:
+        options |= {"compress": "zstd", "zstd_level": 1, "predictor": 3 if floating else 2}
     try:
         with _quiet(), rasterio.open(temporary, "w", **options) as dataset:
             for band, text in enumerate(descriptions or (), 1):
@@ -196,6 +198,7 @@ def write(
     descriptions: Sequence[str] | None = None,
     tags: Mapping[str, str] | None = None,
     cog: bool = False,
+    compressed: bool = True,
 ) -> None:
     """Write an array (rows, columns) or (bands, rows, columns) whole; see `create` for the rest."""
     bands = array if array.ndim == 3 else array[None]
@@ -210,6 +213,7 @@ def write(
         descriptions=descriptions,
         tags=tags,
         cog=cog,
+        compressed=compressed,
     ) as writer:
         for number, values in enumerate(bands, 1):
             writer.write(None, values, number)

@@ -213,6 +213,14 @@ def test_a_strip_matched_on_its_own_is_a_part_of_the_whole(settings):
     both = np.isfinite(part) & np.isfinite(own) & well_inside(tall)[first:last]
     assert both.mean() > 0.5
     assert bad_share((part - own)[both], 0.25) < 0.001
+    # Asked for these rows alone, finer levels match less of what lies around.
+    asked = match(tall.left[seen], tall.right[seen], (-4, 28), **settings, rows=(first - start, last - start))
+    assert asked.disparity.shape == asked.validity.shape == part.shape
+    inner = well_inside(tall)[first:last]
+    assert inner.mean() > 0.5
+    assert (np.isfinite(part) != np.isfinite(asked.disparity))[inner].mean() < 0.001
+    both = inner & np.isfinite(part) & np.isfinite(asked.disparity)
+    assert bad_share((part - asked.disparity)[both], 0.25) < 0.001
 
 
 def test_disparities_are_whole_fractions_and_missing_exactly_where_they_are_invalid(pair, settings):

@@ -72,6 +72,14 @@ def test_a_cloud_optimised_file_is_valid_and_equal(tmp_path):
     assert np.array_equal(rasters.read(tmp_path / "c.tif"), values)
 
 
+@pytest.mark.parametrize("compressed", [True, False])
+def test_compression_changes_the_size_alone(tmp_path, compressed):
+    values = np.zeros((600, 700), np.float32)
+    rasters.write(tmp_path / "z.tif", values, grid=PixelGrid(0, 0, 1, 1, values.shape), compressed=compressed)
+    np.testing.assert_array_equal(rasters.read(tmp_path / "z.tif"), values)
+    assert ((tmp_path / "z.tif").stat().st_size < values.nbytes / 10) == compressed
+
+
 def test_reduced_reading_is_the_block_mean(tmp_path):
     rasters.write(tmp_path / "h.tif", heights(), grid=MAP, crs="EPSG:32632")
     expected = heights().reshape(10, 4, 25, 2).mean((1, 3))[:, ::1]
