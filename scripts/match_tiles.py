@@ -36,6 +36,7 @@ def match_tiles(
     max_features,
     tile_width_px,
     tile_height_px,
+    max_tiles,
     superglue_weights,
     threads,
 ):
@@ -72,7 +73,9 @@ def match_tiles(
     )
     if matcher in LEARNED:
         tile_px = (tile_height_px, tile_width_px)
-        matches = match_wide_strip(placed, scatteritem, matcher=chosen, tile_px=tile_px, threads=threads)
+        matches = match_wide_strip(
+            placed, scatteritem, matcher=chosen, tile_px=tile_px, max_tiles=max_tiles, threads=threads
+        )
     else:
         tiles_mm = control_tiles(camera, candidates)
         first, last = strip_of(len(tiles_mm), scatteritem)
@@ -123,6 +126,7 @@ if __name__ == "__main__":
             max_features=snakemake.params.max_features,
             tile_width_px=snakemake.params.tile_width_px,
             tile_height_px=snakemake.params.tile_height_px,
+            max_tiles=snakemake.params.max_tiles,
             superglue_weights=snakemake.params.superglue_weights,
             threads=snakemake.threads,
         )

@@ -64,11 +64,22 @@ def test_nothing_is_matched_where_one_image_ends():
 
 def test_wide_tiles_cover_the_film_in_order():
     camera = make_camera(half_length_mm=357.0)
-    tiles = wide_tiles(camera, 55.0, 25.0)
+    tiles = wide_tiles(camera, 55.0, 25.0, most=1000)
     assert (np.diff(tiles[:, 0]) >= 0).all()
     points = np.random.default_rng(2).uniform(-1, 1, (2000, 2)) * (357.0, 27.7)
     off = (np.abs(points[:, None] - tiles[None]) / (55.0, 25.0)).max(axis=2).min(axis=1)
     assert off.max() <= 0.5 + 2 / 55.0
+
+
+@pytest.mark.parametrize(("most", "rows"), [(60, 3), (13, 1), (1, 1)])
+def test_fewer_wide_tiles_than_cover_the_film_are_spread_over_it(most, rows):
+    camera = make_camera(half_length_mm=357.0)
+    tiles = wide_tiles(camera, 17.0, 12.0, most=most)  # six in a row
+    columns = np.unique(tiles[:, 0])
+    assert 0.9 * most <= len(tiles) <= most
+    assert len(np.unique(tiles[:, 1])) == rows
+    gaps = np.diff([-357.0, *columns, 357.0])
+    np.testing.assert_allclose(gaps, 714.0 / len(columns) * np.array([0.5, *np.ones(len(columns) - 1), 0.5]))
 
 
 @pytest.mark.slow
@@ -90,7 +101,7 @@ def test_strips_of_wide_tiles_give_what_the_whole_gives_and_lie_where_the_camera
         return points, points, np.ones(len(points))
 
     def strip(name):
-        return match_wide_strip(placed, name, matcher=learned(pair, 4), tile_px=(256, 320), threads=1)
+        return match_wide_strip(placed, name, matcher=learned(pair, 4), tile_px=(256, 320), max_tiles=99, threads=1)
 
     whole = strip("1-of-1")
     count = len(calls)

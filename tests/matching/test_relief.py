@@ -58,7 +58,7 @@ def test_control_from_relief_lies_within_half_a_posting_and_says_so_though_the_f
         scatteritem="1-of-1", reference_dem_heights="ellipsoidal", matcher="structural", template_px=65, search_px=8,
         min_score=0.3, max_ratio=0.9, max_return_px=1.0, relief_template_px=65, relief_min_score=0.3,
         relief_max_ratio=0.9, candidates=400, features="xfeat", max_features=2048, tile_width_px=1920,
-        tile_height_px=1440, superglue_weights=None, threads=1,
+        tile_height_px=1440, max_tiles=60, superglue_weights=None, threads=1,
     )  # fmt: skip
     collect_gcps(
         [tmp_path / "matches.parquet"], tmp_path / "film.tif", tmp_path / "footprint.json", tmp_path / "dem.tif", None,
