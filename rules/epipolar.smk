@@ -15,7 +15,7 @@ rule rectify:
         "../envs/cosp.yaml"
     threads: 2
     resources:
-        mem_mb=memory(1),
+        mem_mb=memory(2),
         runtime=runtime(0.3),
     params:
         **choices("rectify"),

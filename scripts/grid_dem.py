@@ -15,14 +15,14 @@ from cosp.geometry.mapping import utm_crs
 from cosp.imaging.windows import Window, tiles
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
-from cosp.surface.gridding import HALO_CELLS, boxes_meeting, grid_points, map_boxes
+from cosp.surface.gridding import HALO_CELLS, CellPoints, boxes_meeting, grid_cells, map_boxes
 from cosp.surface.intersection import PixelIntersection
 
 CONFIDENCE_BAND = 2  # of validity.tif
 SMOOTH_BAND = 2  # of y_parallax.tif: the field that dense matching allowed for
 MOST_CONFIDENCE = 255
 TILE_M = 5000.0  # ground of one job of a thread: about five million points of a 7 um film
-WINDOWS_AT_HAND = 40  # whose points are kept for the tiles to come: about 25 MB each
+WINDOWS_AT_HAND = 40  # whose points are kept for the tiles to come: up to 17 MB each
 
 
 def grid_dem(
@@ -73,14 +73,25 @@ def grid_dem(
         projector = MapProjector(fore, crs, grid.bounds)
         of_cameras = records.read(height_sigma_path, HeightSigma)
 
+    # The noise of matching falls as confidence rises.
+    weights = (np.arange(MOST_CONFIDENCE + 1) / MOST_CONFIDENCE) ** 2
+    weights[:least_confidence] = 0.0
+
     def map_points(number):
-        """Points of a window on the map, and their weights: the noise of matching falls as confidence rises."""
+        """Points of a window in cells of the grid."""
         window = windows[number]
-        ground, miss_m = pixels.ground(window, rasters.read(disparity_path, window=window))
-        confidence = rasters.read(validity_path, band=CONFIDENCE_BAND, window=window)
-        with np.errstate(invalid="ignore"):
-            good = (miss_m <= summary["miss_limit_m"]) & (confidence >= least_confidence)
-        return map_frame.map_from_local(ground[good]), (confidence[good] / np.float32(MOST_CONFIDENCE)) ** 2
+        row, column = (int(place) for place in grid.pixels((boxes[number, 0], boxes[number, 3])))
+        values = pixels.cell_points(
+            window,
+            rasters.read(disparity_path, window=window),
+            rasters.read(validity_path, band=CONFIDENCE_BAND, window=window),
+            weights=weights,
+            largest_miss_m=summary["miss_limit_m"],
+            map_frame=map_frame,
+            grid=grid,
+            first_cell=(row, column),
+        )
+        return CellPoints(values, row, column)
 
     def with_halo(tile):
         """A tile with what gridding needs around it, and its grid."""
@@ -93,13 +104,9 @@ def grid_dem(
 
     def heights(tile):
         grown, part = with_halo(tile)
-        chosen = boxes_meeting(boxes, part.bounds)
-        parts = [(np.empty((0, 3)), np.empty(0, np.float32)), *(at_hand[number] for number in chosen)]
-        points, weights = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        found = grid_points(
-            points,
-            part,
-            weights=weights,
+        found = grid_cells(
+            [at_hand[number] for number in boxes_meeting(boxes, part.bounds)],
+            grown,
             kernel_cells=kernel_cells,
             gate_sigmas=gate_sigmas,
             point_sigma_m=point_sigma_px * summary["height_per_px_m"],

@@ -1,4 +1,7 @@
-"""Intersect the conjugate rays of a pair: how far they miss each other, and where their ground lies."""
+"""How far the conjugate rays of a pair miss each other, and where its ground lies, from every so-manyth pixel.
+
+`grid_dem` intersects all of them.
+"""
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +19,9 @@ from cosp.surface.intersection import PixelIntersection, height_per_pixel, miss_
 
 WINDOW = (512, 2048)
 SMOOTH_BAND = 2  # of y_parallax.tif: the field that dense matching allowed for
-GAP_STEP = 16  # pixels from one that ray_gap.tif shows to the next; divides the sides of windows
+SAMPLED_EVERY = 4  # pixels from one that is intersected to the next, along rows and columns
+GAP_STEP = 16  # pixels from one that ray_gap.tif shows to the next: a multiple of the other, divides the windows' sides
+MARGIN_PX = 16  # by which ground may lie outside the box of a window's sampled points
 
 
 def triangulate(
@@ -49,7 +54,8 @@ def triangulate(
     disparity_info = rasters.info(disparity_path)
 
     def intersect(window, more_px=0.0):
-        return pixels.ground(window, rasters.read(disparity_path, window=window) + np.float32(more_px))
+        disparity = rasters.read(disparity_path, window=window)[::SAMPLED_EVERY, ::SAMPLED_EVERY]
+        return pixels.ground(window, disparity + np.float32(more_px), every=SAMPLED_EVERY)
 
     windows = tiles(disparity_info.shape, WINDOW)
     sampled = windows[:: max(1, len(windows) // 24)]
@@ -67,15 +73,17 @@ def triangulate(
     log.info("rays may miss by %.2f m; one pixel of parallax is worth %.2f m of height", limit_m, height_per_px_m)
 
     def described(window):
-        """Gap of every so-manyth pixel of a window, how many points there are, how many of them to keep, their box."""
+        """Gaps of a window as ray_gap.tif shows them, how many points there are, how many to keep, their box."""
         ground, miss_m = intersect(window)
         with np.errstate(invalid="ignore"):
             good = miss_m <= limit_m
         box = None
         if good.any():
             points = ground[good]
-            box = {"window": window, "low_m": points.min(0), "high_m": points.max(0)}
-        return miss_m[::GAP_STEP, ::GAP_STEP], int(np.isfinite(miss_m).sum()), int(good.sum()), box
+            margin_m = MARGIN_PX * ground_px_m
+            box = {"window": window, "low_m": points.min(0) - margin_m, "high_m": points.max(0) + margin_m}
+        shown = GAP_STEP // SAMPLED_EVERY
+        return miss_m[::shown, ::shown], int(np.isfinite(miss_m).sum()), int(good.sum()), box
 
     blocks, kept, found, misses = [], 0, 0, []
     shape = tuple(-(-n // GAP_STEP) for n in disparity_info.shape)
@@ -107,7 +115,8 @@ def triangulate(
         summary_path,
         {
             "kind": "points",
-            "version": 2,
+            "version": 3,
+            "sampled_every_px": SAMPLED_EVERY,
             "count": kept,
             "rejected": found - kept,
             "miss_m": summarise(np.concatenate(misses)),
@@ -121,8 +130,8 @@ def triangulate(
 
 
 def thinned(arrays):
-    """Every eighth row and column of arrays, for statistics."""
-    return [array[::8, ::8].copy() for array in arrays]
+    """Every other row and column of arrays, for statistics."""
+    return [array[::2, ::2].copy() for array in arrays]
 
 
 if __name__ == "__main__":

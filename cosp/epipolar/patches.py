@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
+from threading import Lock
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +18,7 @@ from cosp.imaging.windows import Window
 
 Reader = Callable[[Window], ByteArray]
 _HALO_PX = 4  # what interpolation between reduced pixels reaches
+_TILE_PX = 2048  # side of the parts of an image that are reduced at a time; a multiple of every factor
 
 
 class Patches(Protocol):
@@ -27,6 +30,61 @@ class Patches(Protocol):
         """Windows with the given first rows and columns (N,), in reduced pixels; they lie near each other."""
 
 
+class Reduced:
+    """An image at several sizes: each part of it is read once for all reduced ones, when it is first asked for.
+
+    Parameters
+    ----------
+    read : function
+        Grey values of a window of the image.
+    shape : (rows, columns) of the image
+    """
+
+    def __init__(self, read: Reader, shape: tuple[int, int]) -> None:
+        self._read = read
+        self._shape = shape
+        self._halved: dict[tuple[int, int], list[ByteArray]] = {}
+        self._locks: defaultdict[tuple[int, int], Lock] = defaultdict(Lock)
+
+    def __call__(self, window: Window, factor: int) -> ByteArray:
+        """Grey values of a window, in pixels reduced by a power of two; 0 outside the image."""
+        picture = np.zeros(window.shape, np.uint8)
+        inside = window.grown(0, (-(-self._shape[0] // factor), -(-self._shape[1] // factor)))
+        if min(inside.shape) <= 0:
+            return picture
+        if factor == 1:
+            picture[inside.inside(window).slices] = self._read(inside)
+            return picture
+        side = _TILE_PX // factor
+        for row in range(inside.row0 // side, -(-inside.row1 // side)):
+            for column in range(inside.column0 // side, -(-inside.column1 // side)):
+                reduced = self._tile(row, column, factor)
+                tile = Window(
+                    row * side, row * side + reduced.shape[0], column * side, column * side + reduced.shape[1]
+                )
+                part = Window(
+                    max(tile.row0, inside.row0),
+                    min(tile.row1, inside.row1),
+                    max(tile.column0, inside.column0),
+                    min(tile.column1, inside.column1),
+                )
+                picture[part.inside(window).slices] = reduced[part.inside(tile).slices]
+        return picture
+
+    def _tile(self, row: int, column: int, factor: int) -> ByteArray:
+        """A part of the image, reduced by a factor; halved again and again from what is there."""
+        with self._locks[row, column]:
+            halved = self._halved.setdefault((row, column), [])
+            while len(halved) < factor.bit_length() - 1:
+                if not halved:
+                    r, c = row * _TILE_PX, column * _TILE_PX
+                    larger = self._read(Window(r, r + _TILE_PX, c, c + _TILE_PX).grown(0, self._shape))
+                else:
+                    larger = halved[-1]
+                halved.append(block_mean(larger, 2))
+            return halved[factor.bit_length() - 2]
+
+
 def image_patches(read: Reader, shape: tuple[int, int]) -> Patches:
     """Patches of a rectified image that is there.
 
@@ -36,16 +94,12 @@ def image_patches(read: Reader, shape: tuple[int, int]) -> Patches:
         Grey values of a window of the image.
     shape : (rows, columns) of the image
     """
+    reduced = Reduced(read, shape)
 
     def patches(row: NDArray[np.intp], column: NDArray[np.intp], size: tuple[int, int], factor: int) -> Float32Array:
         window = Window(int(row.min()), int(row.max()) + size[0], int(column.min()), int(column.max()) + size[1])
-        full = Window(*(factor * edge for edge in (window.row0, window.row1, window.column0, window.column1)))
-        inside = full.grown(0, shape)
-        picture = np.zeros(full.shape, np.uint8)
-        if min(inside.shape) > 0:
-            picture[inside.inside(full).slices] = read(inside)
         rows, columns = _pixels_of(row - window.row0, column - window.column0, size)
-        return np.asarray(block_mean(picture, factor)[rows, columns], np.float32)
+        return np.asarray(reduced(window, factor)[rows, columns], np.float32)
 
     return patches
 
@@ -61,6 +115,7 @@ def film_patches(read_film: Reader, film_grid: PixelGrid, epipolar_map: Epipolar
         Of the film raster, mm.
     epipolar_map : EpipolarMap
     """
+    reduced = Reduced(read_film, film_grid.shape)
 
     def patches(row: NDArray[np.intp], column: NDArray[np.intp], size: tuple[int, int], factor: int) -> Float32Array:
         rows, columns = _pixels_of(row, column, size)
@@ -72,20 +127,18 @@ def film_patches(read_film: Reader, film_grid: PixelGrid, epipolar_map: Epipolar
         known = np.isfinite(film_rows)
         if not known.any():
             return np.zeros((len(row), *size), np.float32)
-        reach = _HALO_PX * factor
+        # Places in reduced pixels of the film.
+        film_rows, film_columns = ((places + 0.5) / factor - 0.5 for places in (film_rows, film_columns))
+        shape = tuple(-(-n // factor) for n in film_grid.shape)
         shown = Window(
-            (int(film_rows[known].min()) - reach) // factor * factor,
-            int(film_rows[known].max()) + reach,
-            (int(film_columns[known].min()) - reach) // factor * factor,
-            int(film_columns[known].max()) + reach,
-        ).grown(0, film_grid.shape)
+            int(film_rows[known].min()) - _HALO_PX,
+            int(film_rows[known].max()) + _HALO_PX,
+            int(film_columns[known].min()) - _HALO_PX,
+            int(film_columns[known].max()) + _HALO_PX,
+        ).grown(0, (shape[0], shape[1]))
         if min(shown.shape) <= 0:
             return np.zeros((len(row), *size), np.float32)
-        grey = sample(
-            block_mean(read_film(shown), factor),
-            (film_rows - shown.row0 + 0.5) / factor - 0.5,
-            (film_columns - shown.column0 + 0.5) / factor - 0.5,
-        )
+        grey = sample(reduced(shown, factor), film_rows - shown.row0, film_columns - shown.column0)
         return np.asarray(grey.reshape(len(row), *size), np.float32)
 
     return patches

@@ -80,17 +80,22 @@ def _local_planes(values: FloatArray, weights: FloatArray, sigma: float) -> NDAr
     gauss = np.exp(-0.5 * (offset / sigma) ** 2)
     gauss /= gauss.sum()
 
-    def moment(field: FloatArray, order_r: int, order_c: int) -> NDArray[np.float64]:
-        down = ndimage.correlate1d(field, gauss * (offset / sigma) ** order_r, axis=0, mode="constant")
-        return np.asarray(ndimage.correlate1d(down, gauss * (offset / sigma) ** order_c, axis=1, mode="constant"))
+    def moments(field: FloatArray, highest: int) -> dict[tuple[int, int], NDArray[np.float64]]:
+        """Sums about each node of field x row^i x column^j for i + j up to the highest order."""
+        found = {}
+        for i in range(highest + 1):
+            down = ndimage.correlate1d(field, gauss * (offset / sigma) ** i, axis=0, mode="constant")
+            for j in range(highest + 1 - i):
+                along = gauss * (offset / sigma) ** j
+                found[i, j] = np.asarray(ndimage.correlate1d(down, along, axis=1, mode="constant"))
+        return found
 
-    orders = ((0, 0), (1, 0), (0, 1))
-    normal = np.empty((*values.shape, 3, 3))
-    right = np.empty((*values.shape, 3))
-    for i, (ri, ci) in enumerate(orders):
-        right[..., i] = moment(weights * values, ri, ci)
-        for j, (rj, cj) in enumerate(orders):
-            normal[..., i, j] = moment(weights, ri + rj, ci + cj)
     typical = float(weights[weights > 0].mean()) if (weights > 0).any() else 1.0
-    normal[..., range(3), range(3)] += _PRIOR * typical
-    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0, 0])
+    prior = _PRIOR * typical
+    w, z = moments(weights, 2), moments(weights * values, 1)
+    n00, n11, n22 = w[0, 0] + prior, w[2, 0] + prior, w[0, 2] + prior
+    n01, n02, n12 = w[1, 0], w[0, 1], w[1, 1]
+    # Cramer on the normal equations of value and two slopes, of which the value is wanted.
+    minor0, minor1, minor2 = n11 * n22 - n12 * n12, n12 * n02 - n01 * n22, n01 * n12 - n11 * n02
+    determinant = n00 * minor0 + n01 * minor1 + n02 * minor2
+    return np.asarray((z[0, 0] * minor0 + z[1, 0] * minor1 + z[0, 1] * minor2) / determinant)

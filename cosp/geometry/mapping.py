@@ -64,6 +64,11 @@ class MapFrame:
         """Easting, northing, ellipsoidal height (..., 3) of local points (..., 3); NaN outside the area."""
         return self._evaluate(self._to_map, self._local_nodes, local_m)
 
+    @property
+    def lattice_to_map(self) -> tuple[FloatArray, tuple[float, float, float]]:
+        """What `map_from_local` looks up: a lattice, (R, C, 6), and (x, y, step) of its nodes, for compiled loops."""
+        return self._to_map, self._local_nodes
+
     def local_from_map(self, map_m: FloatArray) -> FloatArray:
         """Local points (..., 3) of easting, northing, ellipsoidal height (..., 3); NaN outside the area."""
         return self._evaluate(self._to_local, self._map_nodes, map_m)

@@ -281,7 +281,7 @@ def _to_cog(path: Path, floating: bool) -> None:
             target,
             driver="COG",
             compress="zstd",
-            level=3,
+            level=1,
             predictor="yes",
             bigtiff="if_safer",
             overview_resampling="average",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from cosp.arrays import Float32Array, FloatArray, IntArray
 from cosp.geometry.frames import LocalFrame
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.mapping import MapFrame
+from cosp.imaging.windows import Window
 from cosp.surface import kernels
 
 HALO_CELLS = 4  # what `grid_points` needs around a tile to give the heights of the whole
@@ -39,6 +41,23 @@ class GriddedHeights:
     count: IntArray
 
 
+@dataclass(frozen=True)
+class CellPoints:
+    """Points that lie near each other, in the cells of a grid.
+
+    Parameters
+    ----------
+    values : (N, 4) float32 array
+        Column, row, height in m, weight; a cell's centre lies at whole numbers.
+    row0, column0 : int
+        Cell of the grid at which rows and columns are 0.
+    """
+
+    values: Float32Array
+    row0: int
+    column0: int
+
+
 def grid_points(
     points: FloatArray,
     grid: PixelGrid,
@@ -49,11 +68,7 @@ def grid_points(
     point_sigma_m: float,
     points_per_independent: float,
 ) -> GriddedHeights:
-    """Heights at the cell centres of a grid from points on a surface.
-
-    Each height is that of a plane fitted to the points of the cell and its eight neighbours, the neighbours with
-    less weight: slopes leave no bias however unevenly the points lie. Gross errors are kept out by
-    a gate about medians. Cells without points are filled only where at least five direct neighbours have some.
+    """Heights at the cell centres of a grid from points on a surface; see `grid_cells` for how.
 
     Parameters
     ----------
@@ -63,6 +78,52 @@ def grid_points(
     weights : (N,) array, optional
         Inverse variance of each point, as a multiple of that of `point_sigma_m`; points of weight 0 are left out. All
         1 when left out.
+    kernel_cells, gate_sigmas, point_sigma_m, points_per_independent
+        As of `grid_cells`.
+    """
+    values = np.empty((len(points), 4), np.float32)
+    kernels.points_in_cells(
+        np.ascontiguousarray(points, dtype=float),
+        np.ones(len(points), np.float32) if weights is None else np.asarray(weights, np.float32),
+        cells_of(grid),
+        values,
+    )
+    return grid_cells(
+        [CellPoints(values, 0, 0)],
+        Window(0, grid.shape[0], 0, grid.shape[1]),
+        kernel_cells=kernel_cells,
+        gate_sigmas=gate_sigmas,
+        point_sigma_m=point_sigma_m,
+        points_per_independent=points_per_independent,
+    )
+
+
+def cells_of(grid: PixelGrid) -> tuple[float, float, float, float]:
+    """Coordinates (x, y) of the centre of cell (0, 0), and cells per unit of either."""
+    return grid.x0, grid.y0, 1 / grid.step_x, 1 / grid.step_y
+
+
+def grid_cells(
+    pieces: Sequence[CellPoints],
+    window: Window,
+    *,
+    kernel_cells: float,
+    gate_sigmas: float,
+    point_sigma_m: float,
+    points_per_independent: float,
+) -> GriddedHeights:
+    """Heights at the cell centres of a window of a grid from points on a surface.
+
+    Each height is that of a plane fitted to the points of the cell and its eight neighbours, the neighbours with
+    less weight: slopes leave no bias however unevenly the points lie. Gross errors are kept out by
+    a gate about medians. Cells without points are filled only where at least five direct neighbours have some.
+
+    Parameters
+    ----------
+    pieces : sequence of CellPoints
+        Their points outside the window are not used.
+    window : Window
+        May reach beyond the grid.
     kernel_cells : float
         Standard deviation, in cells, of the Gaussian of the distance between cells that weighs the neighbours' points.
     gate_sigmas : float
@@ -76,19 +137,10 @@ def grid_points(
 
     Notes
     -----
-    Grids cut with a halo of `HALO_CELLS` cells give the heights of the whole.
+    Windows with a halo of `HALO_CELLS` cells give the heights of the whole.
     """
-    rows, columns = grid.shape
-    ordered, starts = kernels.sort_by_cell(
-        np.ascontiguousarray(points, dtype=float),
-        np.ones(len(points), np.float32) if weights is None else np.asarray(weights, np.float32),
-        grid.x0,
-        grid.y0,
-        grid.step_x,
-        grid.step_y,
-        rows,
-        columns,
-    )
+    rows, columns = window.shape
+    ordered, starts = _by_cell(pieces, window)
     medians = kernels.cell_medians(ordered, starts, rows, columns)
     seeds = kernels.neighbourhood_medians(medians)
     slopes = kernels.slopes_per_cell(seeds)
@@ -106,6 +158,21 @@ def grid_points(
     )
     sigma = np.maximum(deviation, np.float32(point_sigma_m)) / np.sqrt(independent)
     return GriddedHeights(height, sigma.astype(np.float32), count)
+
+
+def _by_cell(pieces: Sequence[CellPoints], window: Window) -> tuple[Float32Array, IntArray]:
+    """Points (N, 4) in the order of the window's cells, places from the cell's centre, and where each cell starts."""
+    starts = np.zeros(window.shape[0] * window.shape[1] + 1, np.int32)
+    cells = [np.empty(len(piece.values), np.int32) for piece in pieces]
+    for piece, of_piece in zip(pieces, cells, strict=True):
+        shift = (piece.row0 - window.row0, piece.column0 - window.column0)
+        kernels.count_by_cell(piece.values, *shift, window.shape, of_piece, starts)
+    np.cumsum(starts, out=starts)
+    ordered = np.empty((int(starts[-1]), 4), np.float32)
+    place = starts[:-1].copy()
+    for piece, of_piece in zip(pieces, cells, strict=True):
+        kernels.place_by_cell(piece.values, of_piece, place, ordered)
+    return ordered, starts
 
 
 def map_boxes(frame: LocalFrame, crs: str, low_m: FloatArray, high_m: FloatArray) -> tuple[MapFrame, FloatArray]:

@@ -9,10 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from cosp.arrays import Float32Array, FloatArray
+from cosp.arrays import ByteArray, Float32Array, FloatArray
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.lattices import between_nodes
+from cosp.geometry.mapping import MapFrame
 from cosp.geometry.rays import Rays
 from cosp.imaging.windows import Window
 from cosp.surface import kernels
@@ -32,8 +33,9 @@ class RayTable:
     ----------
     nodes : PixelGrid
         In pixels of the image, x its column and y its row.
-    values : (6, R, C) array
-        Origin in metres and direction at each node; NaN outside the film.
+    values : (R, C, 8) array
+        Origin in metres and direction at each node, and two zeros so that nodes lie on lines of the cache; NaN outside
+        the film.
     """
 
     nodes: PixelGrid
@@ -71,7 +73,7 @@ def tabulate_rays(rays: Callable[[FloatArray], Rays], nodes: PixelGrid, *, large
         The rays between the nodes are not those that the nodes say: such a table cannot stand for them.
     """
     rows, columns = nodes.shape
-    values = np.empty((6, rows, columns))
+    values = np.zeros((rows, columns, 8))
     worst = 0.0
     height = max(1, _BLOCK_NODES // columns)
     for row in range(0, rows, height):
@@ -80,7 +82,7 @@ def tabulate_rays(rays: Callable[[FloatArray], Rays], nodes: PixelGrid, *, large
         sampled = rays(part.centres())
         middle = sampled.direction[:, columns // 2, :, None]
         node = np.concatenate([sampled.origin, sampled.direction / (sampled.direction @ middle)], axis=-1)
-        values[:, row : row + part.shape[0]] = np.moveaxis(node, -1, 0)
+        values[row : row + part.shape[0], :, :6] = node
         worst = max(worst, _error_between(rays, part, node[..., 3:]))
     if not worst < largest_error_rad:
         raise ValueError(
@@ -102,7 +104,7 @@ def _error_between(rays: Callable[[FloatArray], Rays], nodes: PixelGrid, directi
 
 
 def intersect_pixels(
-    fore: RayTable, aft: RayTable, window: Window, disparity: FloatArray, y_parallax: FloatArray
+    fore: RayTable, aft: RayTable, window: Window, disparity: FloatArray, y_parallax: FloatArray, *, every: int = 1
 ) -> tuple[FloatArray, FloatArray]:
     """Ground points of the pixels of a window, and the gap their rays leave.
 
@@ -116,6 +118,8 @@ def intersect_pixels(
         Of the fore image.
     disparity, y_parallax : (H, W) arrays, px
         Aft column minus fore column, NaN for no correspondence; aft row minus fore row.
+    every : int
+        The arrays hold every so-manyth pixel of every so-manyth row of the window.
 
     Returns
     -------
@@ -128,9 +132,9 @@ def intersect_pixels(
     ----------
     [Ghuffar2022] equation 13, in closed form.
     """
-    ground, miss = np.empty((*window.shape, 3)), np.empty(window.shape, np.float32)
+    ground, miss = np.empty((*disparity.shape, 3)), np.empty(disparity.shape, np.float32)
     kernels.intersect_pixels(
-        fore.values, fore.scale(window), aft.values, aft.scale(window), disparity, y_parallax, ground, miss
+        fore.values, fore.scale(window), aft.values, aft.scale(window), every, disparity, y_parallax, ground, miss
     )
     return ground, miss
 
@@ -267,23 +271,80 @@ class PixelIntersection:
             y_parallax_nodes,
         )
 
-    def ground(self, window: Window, disparity: FloatArray) -> tuple[FloatArray, Float32Array]:
-        """Ground points (H, W, 3) in the local frame and gaps (H, W) of a window of the fore image, in metres."""
-        low, high = (self._at(values, self.fore.nodes, window) for values in (self.lowest, self.highest))
+    def ground(self, window: Window, disparity: FloatArray, *, every: int = 1) -> tuple[FloatArray, Float32Array]:
+        """Ground points (H, W, 3) in the local frame and gaps (H, W) of a window of the fore image, in metres.
+
+        With `every`, of every so-manyth pixel of every so-manyth row of it, to which `disparity` belongs.
+        """
+        likely, smooth = self._likely(window, disparity, every)
+        return intersect_pixels(self.fore, self.aft, window, likely, smooth, every=every)
+
+    def cell_points(
+        self,
+        window: Window,
+        disparity: FloatArray,
+        confidence: ByteArray,
+        *,
+        weights: FloatArray,
+        largest_miss_m: float,
+        map_frame: MapFrame,
+        grid: PixelGrid,
+        first_cell: tuple[int, int],
+    ) -> Float32Array:
+        """Points of a window on the map, in cells of a grid: (N, 4) of column, row, height, weight.
+
+        Parameters
+        ----------
+        window : Window
+            Of the fore image.
+        disparity, confidence : (H, W) arrays
+        weights : (256,) array
+            Of points of each confidence; those of weight 0 are left out.
+        largest_miss_m : float
+            Rays may miss each other by no more.
+        map_frame : MapFrame
+            From the local frame to the map.
+        grid : PixelGrid
+        first_cell : (row, column)
+            Cell at which rows and columns are 0; near by, for they are float32.
+        """
+        likely, smooth = self._likely(window, disparity, 1)
+        part = grid.window(first_cell[0], first_cell[0], first_cell[1], first_cell[1])
+        points = np.empty((likely.size, 4), np.float32)
+        count = kernels.points_of_pixels(
+            self.fore.values,
+            self.fore.scale(window),
+            self.aft.values,
+            self.aft.scale(window),
+            likely,
+            smooth,
+            confidence,
+            np.asarray(weights, float),
+            largest_miss_m,
+            *map_frame.lattice_to_map,
+            (part.x0, part.y0, 1 / part.step_x, 1 / part.step_y),
+            points,
+        )
+        return points[:count].copy()
+
+    def _likely(self, window: Window, disparity: FloatArray, every: int) -> tuple[Float32Array, Float32Array]:
+        """Disparities of ground at heights that are expected, NaN in place of others, and y-parallax."""
+        low, high, smooth = (
+            between_nodes(
+                values,
+                ((window.row0 - nodes.y0) / nodes.step_y, (window.column0 - nodes.x0) / nodes.step_x),
+                (every / nodes.step_y, every / nodes.step_x),
+                disparity.shape,
+            )
+            for values, nodes in (
+                (self.lowest, self.fore.nodes),
+                (self.highest, self.fore.nodes),
+                (self.y_parallax, self.y_parallax_nodes),
+            )
+        )
         with np.errstate(invalid="ignore"):
             likely = np.where((disparity >= low) & (disparity <= high), disparity, np.float32(np.nan))
-        smooth = self._at(self.y_parallax, self.y_parallax_nodes, window)
-        return intersect_pixels(self.fore, self.aft, window, likely, smooth)
-
-    @staticmethod
-    def _at(values: FloatArray, nodes: PixelGrid, window: Window) -> Float32Array:
-        """Values at nodes, at every pixel of a window."""
-        return between_nodes(
-            values,
-            ((window.row0 - nodes.y0) / nodes.step_y, (window.column0 - nodes.x0) / nodes.step_x),
-            (1 / nodes.step_y, 1 / nodes.step_x),
-            window.shape,
-        )
+        return np.asarray(likely, np.float32), smooth
 
 
 def miss_limit(miss_m: FloatArray, *, gate_sigmas: float, least_m: float) -> float:

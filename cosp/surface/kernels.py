@@ -7,17 +7,18 @@ import math
 import numpy as np
 from numba import njit
 
-from cosp.arrays import BoolArray, FloatArray, IntArray
+from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 
 _CHUNK = 64  # pixels whose rays are intersected side by side
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
+@njit(nogil=True, cache=True)
 def intersect_pixels(
     fore_table: FloatArray,
     fore_scale: tuple[float, float, float, float],
     aft_table: FloatArray,
     aft_scale: tuple[float, float, float, float],
+    every: int,
     disparity: FloatArray,
     y_parallax: FloatArray,
     ground: FloatArray,
@@ -25,68 +26,159 @@ def intersect_pixels(
 ) -> None:
     """Midpoints of the common perpendiculars of the tabulated rays of conjugate pixels.
 
-    A table, (6, R, C), holds origin and direction at its nodes; the scales are (place among the nodes' rows of the
-    window's first row, rows of nodes per pixel, the same along columns). `disparity` and `y_parallax` are (H, W);
-    `ground` (H, W, 3) and `miss` (H, W) are filled, with NaN where a pixel has no disparity or lies outside a table.
+    A table, (R, C, 8), holds origin and direction at its nodes, and nothing in the last two places; the scales are
+    (place among the nodes' rows of the window's first row, rows of nodes per pixel, the same along columns).
+    `disparity` and `y_parallax` (H, W) are those of every so-manyth pixel of every so-manyth row; `ground`
+    (H, W, 3) and `miss` (H, W) are filled, with NaN where a pixel has no disparity or lies outside a table.
     """
     height, width = disparity.shape
-    node_rows, node_columns = aft_table.shape[1], aft_table.shape[2]
-    flat = aft_table.reshape(-1)
-    plane = np.uint64(node_rows * node_columns)
-    down = np.uint64(node_columns)
-    one = np.uint64(1)
-    last_row, last_column = float(node_rows - 1), float(node_columns - 1)
-    line = np.empty((6, fore_table.shape[2]))
-    # Six values of the fore ray, six of the aft ray, the ground point and the gap of each pixel of a chunk.
-    chunk = np.zeros(16 * _CHUNK)
-    across = np.empty(_CHUNK)
-    along = np.empty(_CHUNK)
-    outside = np.empty(_CHUNK)
-    corner = np.empty(_CHUNK, np.int64)
+    line = np.empty((6, fore_table.shape[1]))
+    chunk = np.zeros(17 * _CHUNK)
+    places = np.empty((3, _CHUNK))
+    for y in range(height):
+        _line_of_nodes(fore_table, fore_scale[0] + fore_scale[1] * every * y, line)
+        for start in range(0, width, _CHUNK):
+            count = min(_CHUNK, width - start)
+            step = fore_scale[3] * every
+            _between_nodes_of_line(line, fore_scale[2] + step * start, step, count, chunk)
+            _aft_rays(aft_table, aft_scale, every, y, start, count, disparity[y], y_parallax[y], places, chunk)
+            _meet(chunk)
+            for t in range(count):
+                outside = chunk[16 * _CHUNK + t]
+                for k in range(3):
+                    ground[y, start + t, k] = chunk[(12 + k) * _CHUNK + t] + outside
+                miss[y, start + t] = chunk[15 * _CHUNK + t] + outside
+
+
+@njit(nogil=True, cache=True)
+def points_of_pixels(
+    fore_table: FloatArray,
+    fore_scale: tuple[float, float, float, float],
+    aft_table: FloatArray,
+    aft_scale: tuple[float, float, float, float],
+    disparity: FloatArray,
+    y_parallax: FloatArray,
+    confidence: ByteArray,
+    weights: FloatArray,
+    largest_miss: float,
+    lattice: FloatArray,
+    lattice_nodes: tuple[float, float, float],
+    cells: tuple[float, float, float, float],
+    points: Float32Array,
+) -> int:
+    """Ground points of conjugate pixels as (column, row, height, weight) in the cells of a map; how many there are.
+
+    The same intersection as `intersect_pixels`, of whose points those are left out whose gap is too large, whose weight
+    is zero or that lie outside the lattice. `weights` (256,) are those of each confidence; `lattice` (R, C, 6) and its
+    nodes (x, y, step) lead from the local frame to the map as in `cosp.geometry.mapping.MapFrame`; `cells` are the
+    map coordinates of the centre of cell (0, 0) and cells per metre, both (x, y). `points` (H W, 4) is filled.
+    """
+    height, width = disparity.shape
+    line = np.empty((6, fore_table.shape[1]))
+    chunk = np.zeros(17 * _CHUNK)
+    places = np.empty((3, _CHUNK))
+    found = 0
     for y in range(height):
         _line_of_nodes(fore_table, fore_scale[0] + fore_scale[1] * y, line)
         for start in range(0, width, _CHUNK):
             count = min(_CHUNK, width - start)
             _between_nodes_of_line(line, fore_scale[2] + fore_scale[3] * start, fore_scale[3], count, chunk)
-            for t in range(count):
-                x = start + t
-                row = aft_scale[0] + aft_scale[1] * (y + y_parallax[y, x])
-                column = aft_scale[2] + aft_scale[3] * (x + disparity[y, x])
-                inside = row >= 0.0 and row < last_row and column >= 0.0 and column < last_column
-                row = row if inside else 0.0
-                column = column if inside else 0.0
-                i, j = np.floor(row), np.floor(column)
-                along[t], across[t] = row - i, column - j
-                corner[t] = np.int64(i * node_columns + j)
-                outside[t] = 0.0 if inside else np.nan
-            for t in range(count):
-                w11 = along[t] * across[t]
-                w10 = along[t] - w11
-                w01 = across[t] - w11
-                w00 = 1.0 - along[t] - w01
-                upper = np.uint64(corner[t])
-                for k in range(6):
-                    lower = upper + down
-                    chunk[(6 + k) * _CHUNK + t] = (
-                        w00 * flat[upper] + w01 * flat[upper + one] + w10 * flat[lower] + w11 * flat[lower + one]
-                    )
-                    upper += plane
+            _aft_rays(aft_table, aft_scale, 1, y, start, count, disparity[y], y_parallax[y], places, chunk)
             _meet(chunk)
+            _onto_map(lattice, lattice_nodes, chunk)
             for t in range(count):
-                for k in range(3):
-                    ground[y, start + t, k] = chunk[(12 + k) * _CHUNK + t] + outside[t]
-                miss[y, start + t] = chunk[15 * _CHUNK + t] + outside[t]
+                weight = weights[confidence[y, start + t]]
+                gap = chunk[15 * _CHUNK + t] + chunk[16 * _CHUNK + t]
+                # A gap of NaN compares false.
+                if gap <= largest_miss and weight > 0.0:
+                    points[found, 0] = (chunk[12 * _CHUNK + t] - cells[0]) * cells[2]
+                    points[found, 1] = (chunk[13 * _CHUNK + t] - cells[1]) * cells[3]
+                    points[found, 2] = chunk[14 * _CHUNK + t]
+                    points[found, 3] = weight
+                    found += 1
+    return found
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
+def _aft_rays(
+    table: FloatArray,
+    scale: tuple[float, float, float, float],
+    every: int,
+    y: int,
+    start: int,
+    count: int,
+    disparity: FloatArray,
+    y_parallax: FloatArray,
+    places: FloatArray,
+    chunk: FloatArray,
+) -> None:
+    """Aft rays of the pixels of a chunk into its lines 6 to 11, and NaN into line 16 where there are none, else 0."""
+    node_columns = table.shape[1]
+    nodes = table.reshape(-1, 8)
+    last_row, last_column = float(table.shape[0] - 1), float(node_columns - 1)
+    along, across, corner = places[0], places[1], places[2]
+    for t in range(count):
+        row = scale[0] + scale[1] * (every * y + y_parallax[start + t])
+        column = scale[2] + scale[3] * (every * (start + t) + disparity[start + t])
+        inside = row >= 0.0 and row < last_row and column >= 0.0 and column < last_column
+        row = row if inside else 0.0
+        column = column if inside else 0.0
+        i, j = np.floor(row), np.floor(column)
+        along[t], across[t] = row - i, column - j
+        corner[t] = i * node_columns + j
+        chunk[16 * _CHUNK + t] = 0.0 if inside else np.nan
+    for t in range(count):
+        w11 = along[t] * across[t]
+        w10 = along[t] - w11
+        w01 = across[t] - w11
+        w00 = 1.0 - along[t] - w01
+        upper = int(corner[t])
+        lower = upper + node_columns
+        for k in range(6):
+            chunk[(6 + k) * _CHUNK + t] = (
+                w00 * nodes[upper, k] + w01 * nodes[upper + 1, k] + w10 * nodes[lower, k] + w11 * nodes[lower + 1, k]
+            )
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
+def _onto_map(lattice: FloatArray, nodes: tuple[float, float, float], chunk: FloatArray) -> None:
+    """Replace the ground points of a chunk by map coordinates and heights; NaN into line 16 outside the lattice."""
+    columns = lattice.shape[1]
+    values = lattice.reshape(-1)
+    last_u, last_v = float(columns - 1), float(lattice.shape[0] - 1)
+    per_step = 1.0 / nodes[2]
+    for t in range(_CHUNK):
+        u = (chunk[12 * _CHUNK + t] - nodes[0]) * per_step
+        v = (chunk[13 * _CHUNK + t] - nodes[1]) * per_step
+        h = chunk[14 * _CHUNK + t]
+        inside = u >= 0.0 and v >= 0.0 and u < last_u and v < last_v
+        u = u if inside else 0.0
+        v = v if inside else 0.0
+        i, j = np.floor(v), np.floor(u)
+        q, p = v - i, u - j
+        w11 = p * q
+        w10 = q - w11
+        w01 = p - w11
+        w00 = 1.0 - q - w01
+        upper = np.int64(i * columns + j) * 6
+        lower = upper + columns * 6
+        for k in range(3):
+            base = w00 * values[upper + k] + w01 * values[upper + 6 + k]
+            base += w10 * values[lower + k] + w11 * values[lower + 6 + k]
+            slope = w00 * values[upper + 3 + k] + w01 * values[upper + 9 + k]
+            slope += w10 * values[lower + 3 + k] + w11 * values[lower + 9 + k]
+            chunk[(12 + k) * _CHUNK + t] = base + h * slope
+        chunk[16 * _CHUNK + t] += 0.0 if inside else np.nan
 
 
 @njit(nogil=True, cache=True)
 def _line_of_nodes(table: FloatArray, row: float, line: FloatArray) -> None:
-    """Values (6, C) of a table (6, R, C) on a row between its rows of nodes."""
-    i = min(max(int(row), 0), table.shape[1] - 2)
+    """Values (6, C) of a table (R, C, 8) on a row between its rows of nodes."""
+    i = min(max(int(row), 0), table.shape[0] - 2)
     part = row - i
     for k in range(6):
-        upper, lower = table[k, i], table[k, i + 1]
         for j in range(line.shape[1]):
-            line[k, j] = upper[j] + part * (lower[j] - upper[j])
+            line[k, j] = table[i, j, k] + part * (table[i + 1, j, k] - table[i, j, k])
 
 
 @njit(nogil=True, cache=True)
@@ -135,50 +227,53 @@ def _meet(chunk: FloatArray) -> None:
 
 
 @njit(nogil=True, cache=True)
-def sort_by_cell(
-    points: FloatArray,
-    weights: FloatArray,
-    x0: float,
-    y0: float,
-    step_x: float,
-    step_y: float,
-    rows: int,
-    columns: int,
-) -> tuple[FloatArray, IntArray]:
-    """Points as (column, row, height, weight) in the order of their cells, and where each cell starts.
+def points_in_cells(
+    points: FloatArray, weights: Float32Array, cells: tuple[float, float, float, float], result: Float32Array
+) -> None:
+    """Fill `result`, (N, 4), with (column, row, height, weight) of points (N, 3); `cells` as of `points_of_pixels`."""
+    for n in range(points.shape[0]):
+        result[n, 0] = (points[n, 0] - cells[0]) * cells[2]
+        result[n, 1] = (points[n, 1] - cells[1]) * cells[3]
+        result[n, 2] = points[n, 2]
+        result[n, 3] = weights[n]
+
+
+@njit(nogil=True, cache=True)
+def count_by_cell(
+    points: Float32Array, row0: int, column0: int, shape: tuple[int, int], cells: IntArray, starts: IntArray
+) -> None:
+    """Write the cell of each of the points (N, 4) into `cells`, -1 for none, and count them one place further on.
 
     A point belongs to the cell whose centre is nearest. Points outside the grid or without weight are left out.
+    `row0` and `column0` are the cell of the grid that the points' cell (0, 0) is.
     """
-    count = points.shape[0]
-    per_x = 1.0 / step_x
-    per_y = 1.0 / step_y
-    cells = np.empty(count, np.int32)
-    starts = np.zeros(rows * columns + 1, np.int64)
-    for n in range(count):
-        u = (points[n, 0] - x0) * per_x + 0.5
-        v = (points[n, 1] - y0) * per_y + 0.5
-        cells[n] = -1
-        if 0.0 <= u < columns and 0.0 <= v < rows and weights[n] > 0.0 and not np.isnan(points[n, 2]):
-            cell = int(v) * columns + int(u)
-            cells[n] = cell
+    rows, columns = np.float32(shape[0]), np.float32(shape[1])
+    more_rows, more_columns = np.float32(row0) + np.float32(0.5), np.float32(column0) + np.float32(0.5)
+    zero = np.float32(0)
+    for n in range(points.shape[0]):
+        u = points[n, 0] + more_columns
+        v = points[n, 1] + more_rows
+        cell = -1
+        if u >= zero and u < columns and v >= zero and v < rows and points[n, 3] > zero and not np.isnan(points[n, 2]):
+            cell = np.int32(v) * np.int32(shape[1]) + np.int32(u)
             starts[cell + 1] += 1
-    for cell in range(rows * columns):
-        starts[cell + 1] += starts[cell]
-    place = starts[:-1].copy()
-    ordered = np.empty((starts[-1], 4), np.float32)
-    for n in range(count):
+        cells[n] = cell
+
+
+@njit(nogil=True, cache=True)
+def place_by_cell(points: Float32Array, cells: IntArray, place: IntArray, ordered: Float32Array) -> None:
+    """Copy points to where the next ones of their cells go, with columns and rows from the cell's centre."""
+    for n in range(points.shape[0]):
         cell = cells[n]
         if cell >= 0:
-            # Places within the grid, relative to the cell's centre: float32 keeps them to 1e-7 of a cell.
-            u = (points[n, 0] - x0) * per_x
-            v = (points[n, 1] - y0) * per_y
             k = place[cell]
-            ordered[k, 0] = u - int(u + 0.5)
-            ordered[k, 1] = v - int(v + 0.5)
-            ordered[k, 2] = points[n, 2]
-            ordered[k, 3] = weights[n]
             place[cell] = k + 1
-    return ordered, starts
+            u = points[n, 0]
+            v = points[n, 1]
+            ordered[k, 0] = u - np.floor(u + np.float32(0.5))
+            ordered[k, 1] = v - np.floor(v + np.float32(0.5))
+            ordered[k, 2] = points[n, 2]
+            ordered[k, 3] = points[n, 3]
 
 
 @njit(nogil=True, cache=True)

@@ -14,11 +14,13 @@ from scipy.stats import binned_statistic_2d
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.rays import meet
 from cosp.imaging.windows import Window
-from cosp.surface.gridding import grid_points
+from cosp.surface.gridding import CellPoints, cells_of, grid_cells, grid_points
 from cosp.surface.intersection import intersect_pixels
+from cosp.surface.kernels import points_in_cells
 from tests.surface.synthetic import camera, conjugate_pixels, film_of, ray_table
 
 ROUNDS = 5
+CHOICES = {"kernel_cells": 0.5, "gate_sigmas": 5.0, "point_sigma_m": 1.5, "points_per_independent": 9.0}
 
 
 def normal_equations(first, second):
@@ -91,11 +93,15 @@ def gridding(count, rng):
             "bins": [grid.shape[0] // 10 + 1, grid.shape[1]],
             "range": [[ymax - (ymax - ymin) / 10, ymax], [xmin, xmax]],
         }
+        # As the rule has them: the intersection gives points in cells of the grid.
+        in_cells = np.empty((len(points), 4), np.float32)
+        points_in_cells(points, np.ones(len(points), np.float32), cells_of(grid), in_cells)
+        pieces = [CellPoints(in_cells, 0, 0)]
+        window = Window(0, grid.shape[0], 0, grid.shape[1])
         times = interleaved(
             {
-                "robust planes, compiled": lambda grid=grid: grid_points(
-                    points, grid, kernel_cells=0.5, gate_sigmas=5.0, point_sigma_m=1.5, points_per_independent=9.0
-                ),
+                "robust planes, compiled": lambda window=window, pieces=pieces: grid_cells(pieces, window, **CHOICES),
+                "robust planes, from x y z": lambda grid=grid: grid_points(points, grid, **CHOICES),
                 "scipy mean of the cell": lambda bins=bins, few=few: binned_statistic_2d(
                     points[:few, 1], points[:few, 0], points[:few, 2], "mean", **bins
                 ),

@@ -10,9 +10,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from cosp.epipolar.parallax import measure_y_parallax, node_grid
-from cosp.epipolar.patches import image_patches
+from cosp.epipolar.patches import Reduced, image_patches
 from cosp.epipolar.smoothing import local_median, smooth_field
 from cosp.errors import NotEnoughMatchesError
+from cosp.imaging.windows import Window
 
 SHAPE = (1100, 900)
 CHOICES = {
@@ -154,3 +155,25 @@ def test_a_smooth_field_goes_on_with_its_slope_and_leaves_blunders_out(rng):
     measured_nodes = np.isfinite(values)
     assert (field - truth)[measured_nodes].std() < 0.05
     assert np.abs(field - truth)[15:25, 10:20].max() < 0.5
+
+
+def test_a_reduced_image_is_the_mean_of_blocks_and_is_read_once(rng):
+    image = rng.integers(0, 256, (4500, 2300)).astype(np.uint8)
+    read = []
+
+    def reader(window):
+        read.append(window)
+        return image[window.slices]
+
+    reduced = Reduced(reader, image.shape)
+    for factor in (16, 4, 2):
+        part = Window(-3, 4480 // factor - 5, 7, 2288 // factor)
+        blocks = image[: 4480 // factor * factor, : 2288 // factor * factor].astype(float)
+        blocks = blocks.reshape(4480 // factor, factor, 2288 // factor, factor).mean(axis=(1, 3))
+        found = reduced(part, factor)
+        assert not found[:3].any()
+        # Rounded once for each halving.
+        assert np.abs(found[3:] - blocks[: part.row1, 7:]).max() <= 0.5 * np.log2(factor) + 1e-6
+    assert len(read) == len(set(read)) == 6
+    assert_array_equal(reduced(Window(100, 130, 2290, 2310), 1)[:, :10], image[100:130, 2290:])
+    assert not reduced(Window(5000, 5010, 0, 4), 2).any()

@@ -9,6 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from cosp.camera.field import FilmField
+from cosp.geometry.grids import PixelGrid
+from cosp.geometry.mapping import MapFrame
 from cosp.geometry.rays import Rays, meet
 from cosp.imaging.windows import Window
 from cosp.surface.intersection import (
@@ -20,7 +22,7 @@ from cosp.surface.intersection import (
     pixel_on_ground,
     tabulate_rays,
 )
-from tests.surface.synthetic import LARGEST_ERROR_RAD, PIXEL_MM, camera, conjugate_pixels, film_of, ray_table
+from tests.surface.synthetic import LARGEST_ERROR_RAD, ORIGIN, PIXEL_MM, camera, conjugate_pixels, film_of, ray_table
 
 # Two rows each from all over a film, wide enough for more pixels than are intersected side by side, and not a multiple.
 WINDOWS = [Window(row, row + 2, -4000, 4001) for row in (-51_000, -30_011, -9_000, -1, 7, 20_333, 44_000, 50_990)]
@@ -204,6 +206,52 @@ def test_a_prepared_pair_leaves_out_disparities_of_ground_that_cannot_be(pair):
     left_px = np.abs(y_parallax - middle)[~unlikely]
     assert 0.5 < np.median(miss_m[~unlikely][left_px > 1] / left_px[left_px > 1]) < 3
     assert np.abs(found - ground_m)[~unlikely].max() < 10 * left_px.max() + 1
+
+
+def test_points_on_the_map_are_those_of_the_closed_form(pair, tables):
+    """The way of `grid_dem`: from pixels to cells of the map in one go, without those that are not to be used."""
+    rng = np.random.default_rng(8)
+    window = Window(20_333, 20_340, -500, 1001)
+    ground_m, disparity, y_parallax = conjugate_pixels(*pair, window, rng.uniform(0, 3000, window.shape))
+    y_parallax += rng.normal(0, 1, window.shape)
+    nodes = nodes_over((window.column0, window.row0), (window.column1 - 1, window.row1 - 1), spacing_px=1.0)
+    anything = np.full((2, 2), 1e4)
+    pixels = PixelIntersection(*tables, -anything, anything, y_parallax, nodes)
+    disparity = disparity.astype(np.float32)
+    disparity[:, ::7] = np.nan
+    confidence = rng.integers(0, 256, window.shape).astype(np.uint8)
+    weights = np.where(np.arange(256) < 40, 0.0, np.arange(256) / 255)
+    found, miss_m = pixels.ground(window, disparity)
+    few, few_miss_m = pixels.ground(window, disparity[::3, ::3], every=3)
+    assert_allclose(few, found[::3, ::3], atol=1e-4)
+    assert_allclose(few_miss_m, miss_m[::3, ::3], atol=1e-4)
+
+    limit_m = float(np.nanmedian(miss_m))
+    to_map = MapFrame(ORIGIN, "EPSG:32632", (0.0, 0.0, 1.0, 1.0), margin_m=1.0)
+    corners = to_map.map_from_geodetic(ORIGIN.geodetic_from_local(ground_m.reshape(-1, 3)))[:, :2]
+    bounds = (*corners.min(axis=0), *corners.max(axis=0))
+    to_map = MapFrame(ORIGIN, "EPSG:32632", bounds)
+    grid = PixelGrid.covering(bounds, 10.0)
+    kept = (miss_m <= limit_m) & (confidence >= 40)
+    assert 0.2 < kept.mean() < 0.5
+    expected = to_map.map_from_local(found[kept])
+    first = (grid.shape[0] // 2, 3)
+    points = pixels.cell_points(
+        window,
+        disparity,
+        confidence,
+        weights=weights,
+        largest_miss_m=limit_m,
+        map_frame=to_map,
+        grid=grid,
+        first_cell=first,
+    )
+    assert points.dtype == np.float32
+    rows, columns = grid.pixels(expected[:, :2])
+    assert_allclose(points[:, 0], columns - first[1], atol=1e-4)
+    assert_allclose(points[:, 1], rows - first[0], atol=1e-4)
+    assert_allclose(points[:, 2], expected[:, 2], atol=1e-3)
+    assert_allclose(points[:, 3], weights[confidence[kept]], rtol=1e-6)
 
 
 def test_the_miss_limit_follows_the_noise_but_has_a_floor():
