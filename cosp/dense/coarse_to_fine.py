@@ -340,8 +340,14 @@ def _matched(
         prior = np.full(wide.shape, (low + high) / 2, np.float32)
     else:
         finer = task.before_level != task.step.level
-        prior = prior_of(task.before, wide, finer=finer, otherwise=(low + high) / (4 if finer else 2), memory=memory)
-        np.clip(prior, low, high, out=prior)
+        prior = prior_of(
+            task.before,
+            wide,
+            finer=finer,
+            otherwise=(low + high) / (4 if finer else 2),
+            limits=task.range_px,
+            memory=memory,
+        )
     right = resample_right(
         task.right,
         prior,
@@ -406,14 +412,12 @@ def _cleaned(
         255 * least_uniqueness,
         int(Validity.LOW_CORRELATION),
         int(Validity.INCONSISTENT),
+        FRACTIONS,
         tile.validity,
         tile.similarity,
     )
     islands = speckles(disparity, largest_speckle_px=largest_speckle_px, speckle_step_px=speckle_step_px)
     kernels.take_out(islands, int(Validity.SPECKLE), disparity, tile.validity)
-    disparity *= FRACTIONS
-    np.rint(disparity, out=disparity)
-    disparity /= FRACTIONS
     return DisparityMap(disparity, tile.validity, tile.confidence, tile.similarity)
 
 

@@ -37,6 +37,7 @@ SAMPLE_BLOCK = 16  # pixels that the vector resampling takes at once
 RIM = 4  # zeros around a picture that is resampled: what is read at once reaches so far
 HALF_ROWS, HALF_COLUMNS = CENSUS_ROWS // 2, CENSUS_COLUMNS // 2
 CENTRE = HALF_ROWS * CENSUS_COLUMNS + HALF_COLUMNS
+TEXTURED = 9  # side of the window in which texture is measured
 CORRELATED = 15  # side of the window in which pictures must look alike, a multiple of three
 MID_GREY = 128
 
@@ -909,59 +910,56 @@ def select_plain(
 
 @njit(nogil=True, cache=True)
 def flag_windows(
-    image: Any, half: int, least_sd: float, saturated_from: int, flat_flag: int, saturated_flag: int, flags: Any
+    image: Any, least_sd: float, saturated_from: int, flat_flag: int, saturated_flag: int, flags: Any
 ) -> None:
-    """Add the flags of windows of 2 half + 1 pixels a side with little texture, and of mostly saturated ones.
+    """Add the flags of windows of TEXTURED pixels a side with little texture, and of mostly saturated ones.
 
     Windows are cut at the picture's edges. Integers of 32 bits hold windows of up to 11 pixels a side.
     """
     rows, columns = image.shape
-    # Sums down the window's height, with nothing beside the picture. The count of saturated pixels rides on the sum of
-    # grey values, 65536 times.
-    sums = np.zeros(columns + 2 * half, np.int32)
-    squares = np.zeros(columns + 2 * half, np.int32)
-    total = np.empty(columns, np.int32)
-    square = np.empty(columns, np.int32)
-    widths = np.empty(columns, np.int32)
-    for column in range(columns):
-        widths[column] = min(column + half, columns - 1) - max(column - half, 0) + 1
+    half = TEXTURED // 2
+    # Sums down the window's height, with nothing beside the picture; then of three such side by side, three of which
+    # are a window. The count of saturated pixels rides on the sum of grey values, 65536 times.
+    sums, threes = np.zeros(columns + TEXTURED, np.int32), np.zeros(columns + TEXTURED, np.int32)
+    squares, three_squares = np.zeros(columns + TEXTURED, np.int32), np.zeros(columns + TEXTURED, np.int32)
+    inner, inner_squares = sums[half:], squares[half:]
+    nothing = np.zeros(columns, np.uint8)
+    sizes = np.empty(columns, np.int32)
     least_variance = np.float32(least_sd * least_sd)
     for row in range(-half, rows):
-        if row + half < rows:
-            _add_line(image[row + half], np.int32(1), saturated_from, sums[half:], squares[half:])
-        if row - half - 1 >= 0:
-            _add_line(image[row - half - 1], np.int32(-1), saturated_from, sums[half:], squares[half:])
+        below, above = row + half, row - half - 1
+        entering, leaving = image[below] if below < rows else nothing, image[above] if above >= 0 else nothing
+        for column in range(columns):
+            new, old = np.int32(entering[column]), np.int32(leaving[column])
+            new_bright = np.int32(65536) if new >= saturated_from else np.int32(0)
+            old_bright = np.int32(65536) if old >= saturated_from else np.int32(0)
+            inner[column] = np.int32(inner[column] + np.int32(np.int32(new + new_bright) - np.int32(old + old_bright)))
+        for column in range(columns):
+            new, old = np.int32(entering[column]), np.int32(leaving[column])
+            inner_squares[column] = np.int32(
+                inner_squares[column] + np.int32(np.int32(new * new) - np.int32(old * old))
+            )
         if row < 0:
             continue
-        total[:] = 0
-        square[:] = 0
-        for shift in range(2 * half + 1):
-            for column in range(columns):
-                total[column] += sums[column + shift]
-            for column in range(columns):
-                square[column] += squares[column + shift]
-        height = np.int32(min(row + half, rows - 1) - max(row - half, 0) + 1)
+        _add_threes(sums, threes)
+        _add_threes(squares, three_squares)
+        height = min(row + half, rows - 1) - max(row - half, 0) + 1
         for column in range(columns):
-            size = np.int32(height * widths[column])
-            bright = np.int32(total[column] >> np.int32(16))
-            grey = np.int32(total[column] & np.int32(0xFFFF))
-            scatter = np.int32(np.int32(square[column] * size) - np.int32(grey * grey))  # size^2 times the variance
+            sizes[column] = height * (min(column + half, columns - 1) - max(column - half, 0) + 1)
+        line = flags[row]
+        for column in range(columns):
+            size = sizes[column]
+            total = np.int32(np.int32(threes[column] + threes[column + 3]) + threes[column + 6])
+            square = np.int32(np.int32(three_squares[column] + three_squares[column + 3]) + three_squares[column + 6])
+            bright = np.int32(total >> np.int32(16))
+            grey = np.int32(total & np.int32(0xFFFF))
+            scatter = np.int32(np.int32(square * size) - np.int32(grey * grey))  # size^2 times the variance
             is_flat = np.float32(scatter) < least_variance * np.float32(np.int32(size * size))
             is_bright = np.int32(bright + bright) > size
             flag = (np.uint8(flat_flag) if is_flat else np.uint8(0)) | (
                 np.uint8(saturated_flag) if is_bright else np.uint8(0)
             )
-            flags[row, column] |= flag
-
-
-@njit(nogil=True, cache=True, inline="always")
-def _add_line(line: Any, sign: int, saturated_from: int, sums: Any, squares: Any) -> None:
-    """Add (or take away) a line of grey values, and their squares."""
-    for column in range(len(line)):
-        value = np.int32(line[column])
-        bright = np.int32(65536) if line[column] >= saturated_from else np.int32(0)
-        sums[column] += np.int32(sign * np.int32(value + bright))
-        squares[column] += np.int32(sign * np.int32(value * value))
+            line[column] |= flag
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -1049,7 +1047,7 @@ def _window(threes: Any, column: int) -> int:
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def clean(
     disparity: Any,
     alike: Any,
@@ -1058,14 +1056,18 @@ def clean(
     least_uniqueness: float,
     unlike_flag: int,
     ambiguous_flag: int,
+    fractions: int,
     flags: Any,
     similarity: Any,
 ) -> None:
-    """Take out what is flagged, does not look alike or does not stand out; correlation as a byte."""
+    """Take out what is flagged, does not look alike or does not stand out; correlation as a byte.
+
+    Disparities are rounded to so many fractions of a pixel, a power of two.
+    """
     rows, columns = disparity.shape
     least_correlation, least_uniqueness = np.float32(least_correlation), np.float32(least_uniqueness)
     unlike, ambiguous = np.uint8(unlike_flag), np.uint8(ambiguous_flag)
-    zero, one = np.float32(0), np.float32(1)
+    zero, one, parts = np.float32(0), np.float32(1), np.float32(fractions)
     for row in range(rows):
         for column in range(columns):
             value = alike[row, column]
@@ -1074,7 +1076,8 @@ def clean(
             doubts |= ambiguous if np.float32(uniqueness[row, column]) < least_uniqueness else np.uint8(0)
             flag |= doubts if flag == 0 else np.uint8(0)
             flags[row, column] = flag
-            disparity[row, column] = disparity[row, column] if flag == 0 else np.float32(np.nan)
+            rounded = np.float32(np.rint(disparity[row, column] * parts)) / parts
+            disparity[row, column] = rounded if flag == 0 else np.float32(np.nan)
             similarity[row, column] = np.uint8(np.int32(np.float32(255) * min(max(value, zero), one)))
 
 

@@ -154,7 +154,13 @@ def median_of_given(disparity: Float32Array) -> Float32Array:
 
 
 def prior_of(
-    disparity: Float32Array, window: Window, *, finer: bool, otherwise: float, memory: Workspace | None = None
+    disparity: Float32Array,
+    window: Window,
+    *,
+    finer: bool,
+    otherwise: float,
+    limits: tuple[float, float] = (-np.inf, np.inf),
+    memory: Workspace | None = None,
 ) -> Float32Array:
     """What a pass knows beforehand in a window: the disparity of the pass before, whole, without outliers and smooth.
 
@@ -168,6 +174,8 @@ def prior_of(
         The level to come is the next finer one, so that numbers double too.
     otherwise : float
         What to take where the pass before found nothing at all, in pixels of its level.
+    limits : (lowest, highest)
+        That no prior exceeds, in pixels of the level to come.
     memory : Workspace
         Where the result lies, which then lasts until it is used for the next.
     """
@@ -182,6 +190,7 @@ def prior_of(
     if np.isnan(known).all():
         return np.full(window.shape, otherwise * ratio, np.float32)
     smooth = cv2.GaussianBlur(cv2.medianBlur(fill_holes(known), 5), (0, 0), 1.0)
+    np.clip(smooth, limits[0] / ratio, limits[1] / ratio, out=smooth)
     prior: Float32Array = (memory or Workspace()).array("prior", window.shape, np.float32)
     if finer:
         kernels.enlarge(smooth, window.row0 - 2 * around.row0, window.column0 - 2 * around.column0, prior)

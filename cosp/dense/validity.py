@@ -17,7 +17,7 @@ from cosp.geometry.statistics import summarise
 CORRELATION_WINDOW_PX = kernels.CORRELATED
 """Side of the window in which the two pictures must look alike."""
 
-TEXTURE_WINDOW_PX = 9
+TEXTURE_WINDOW_PX = kernels.TEXTURED
 """Side of the window in which texture is measured: the census looks as far."""
 
 
@@ -63,7 +63,6 @@ def picture_validity(
     bits = no_data(image, no_data_flag)
     kernels.flag_windows(
         image,
-        TEXTURE_WINDOW_PX // 2,
         least_texture_sd,
         saturated_from,
         int(Validity.LOW_TEXTURE),
