@@ -85,7 +85,7 @@ def points_of_pixels(
             _between_nodes_of_line(line, fore_scale[2] + fore_scale[3] * start, fore_scale[3], count, chunk)
             _aft_rays(aft_table, aft_scale, 1, y, start, count, disparity[y], y_parallax[y], places, chunk)
             _meet(chunk)
-            _onto_map(lattice, lattice_nodes, chunk)
+            _onto_map(lattice, lattice_nodes, places, chunk)
             for t in range(count):
                 weight = weights[confidence[y, start + t]]
                 gap = chunk[15 * _CHUNK + t] + chunk[16 * _CHUNK + t]
@@ -127,48 +127,63 @@ def _aft_rays(
         along[t], across[t] = row - i, column - j
         corner[t] = i * node_columns + j
         chunk[16 * _CHUNK + t] = 0.0 if inside else np.nan
-    for t in range(count):
-        w11 = along[t] * across[t]
-        w10 = along[t] - w11
-        w01 = across[t] - w11
-        w00 = 1.0 - along[t] - w01
+    t = 0
+    while t < count:
+        stop = _end_of_run(corner, chunk, t, count)
         upper = int(corner[t])
         lower = upper + node_columns
         for k in range(6):
-            chunk[(6 + k) * _CHUNK + t] = (
-                w00 * nodes[upper, k] + w01 * nodes[upper + 1, k] + w10 * nodes[lower, k] + w11 * nodes[lower + 1, k]
-            )
+            base = nodes[upper, k]
+            by_row, by_column = nodes[lower, k] - base, nodes[upper + 1, k] - base
+            by_both = nodes[lower + 1, k] - nodes[lower, k] - by_column
+            for u in range(t, stop):
+                chunk[(6 + k) * _CHUNK + u] = base + along[u] * by_row + across[u] * (by_column + along[u] * by_both)
+        t = stop
+
+
+@njit(nogil=True, cache=True)
+def _end_of_run(corner: FloatArray, chunk: FloatArray, start: int, count: int) -> int:
+    """Where the run of pixels of a chunk ends that lie between the same nodes as the first; what is nowhere joins."""
+    stop = start + 1
+    while stop < count and (corner[stop] == corner[start] or chunk[16 * _CHUNK + stop] != 0.0):
+        stop += 1
+    return stop
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
-def _onto_map(lattice: FloatArray, nodes: tuple[float, float, float], chunk: FloatArray) -> None:
+def _onto_map(lattice: FloatArray, nodes: tuple[float, float, float], places: FloatArray, chunk: FloatArray) -> None:
     """Replace the ground points of a chunk by map coordinates and heights; NaN into line 16 outside the lattice."""
     columns = lattice.shape[1]
-    values = lattice.reshape(-1)
+    values = lattice.reshape(-1, 6)
     last_u, last_v = float(columns - 1), float(lattice.shape[0] - 1)
     per_step = 1.0 / nodes[2]
+    down, along, corner = places[0], places[1], places[2]
     for t in range(_CHUNK):
         u = (chunk[12 * _CHUNK + t] - nodes[0]) * per_step
         v = (chunk[13 * _CHUNK + t] - nodes[1]) * per_step
-        h = chunk[14 * _CHUNK + t]
         inside = u >= 0.0 and v >= 0.0 and u < last_u and v < last_v
         u = u if inside else 0.0
         v = v if inside else 0.0
         i, j = np.floor(v), np.floor(u)
-        q, p = v - i, u - j
-        w11 = p * q
-        w10 = q - w11
-        w01 = p - w11
-        w00 = 1.0 - q - w01
-        upper = np.int64(i * columns + j) * 6
-        lower = upper + columns * 6
-        for k in range(3):
-            base = w00 * values[upper + k] + w01 * values[upper + 6 + k]
-            base += w10 * values[lower + k] + w11 * values[lower + 6 + k]
-            slope = w00 * values[upper + 3 + k] + w01 * values[upper + 9 + k]
-            slope += w10 * values[lower + 3 + k] + w11 * values[lower + 9 + k]
-            chunk[(12 + k) * _CHUNK + t] = base + h * slope
+        down[t], along[t] = v - i, u - j
+        corner[t] = i * columns + j
         chunk[16 * _CHUNK + t] += 0.0 if inside else np.nan
+    t = 0
+    while t < _CHUNK:
+        stop = _end_of_run(corner, chunk, t, _CHUNK)
+        upper = int(corner[t])
+        lower = upper + columns
+        for k in range(3):
+            a0, b0 = values[upper, k], values[upper, k + 3]
+            a1, b1 = values[lower, k] - a0, values[lower, k + 3] - b0
+            a2, b2 = values[upper + 1, k] - a0, values[upper + 1, k + 3] - b0
+            a3, b3 = values[lower + 1, k] - a0 - a1 - a2, values[lower + 1, k + 3] - b0 - b1 - b2
+            # Heights are the last of the three to be replaced: until then they are what the slopes go with.
+            for n in range(t, stop):
+                base = a0 + down[n] * a1 + along[n] * (a2 + down[n] * a3)
+                slope = b0 + down[n] * b1 + along[n] * (b2 + down[n] * b3)
+                chunk[(12 + k) * _CHUNK + n] = base + chunk[14 * _CHUNK + n] * slope
+        t = stop
 
 
 @njit(nogil=True, cache=True)
