@@ -29,13 +29,13 @@ from cosp.imaging.windows import Window, tiles
 _log = logging.getLogger(__name__)
 
 TILE_PX = 1792
-HALO_PX = 48
+HALO_PX = 32
 """What a tile sees of its neighbours."""
 
 STRIP_HALO_PX = 256
 """What a strip matched on its own must see of its neighbours: coarse levels look further."""
 
-BAND_ROWS = 512
+BAND_ROWS = 1024
 """Whole rows taken at once where tiles will not do."""
 
 LEFT_OVER = 32
