@@ -52,6 +52,11 @@ def warp(ground, disparity, *, y_parallax=0.0):
             back = np.interp(across + disparity[row], across[given], source[row][given], left=np.inf, right=np.inf)
             seen[row] = np.abs(back - across) < 1.5
     source_rows = np.arange(rows)[:, None] - np.broadcast_to(y_parallax, disparity.shape)
+    if np.any(y_parallax):  # what a right pixel shows has the disparity of the row that it comes from
+        above = np.clip(np.floor(source_rows).astype(int), 0, rows - 2)
+        weight = np.clip(source_rows - above, 0, 1)
+        upper, lower = (np.take_along_axis(source, row, axis=0) for row in (above, above + 1))
+        source = upper + weight * (lower - upper)
     coefficients = spline_filter(ground, order=5)
     right = map_coordinates(coefficients, [source_rows, np.nan_to_num(source)], order=5, mode="mirror", prefilter=False)
     right[np.isnan(source)] = np.nan
