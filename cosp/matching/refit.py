@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosp.arrays import FloatArray
+from cosp.camera.derivatives import film_derivatives
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.robust import geman_mcclure_weights
 
@@ -17,8 +18,6 @@ _RATES = np.radians([0.5, 0.5, 0.3])
 PRIOR_SIGMA: FloatArray = np.concatenate([_POSITION, _VELOCITY, _ANGLES, _RATES, [0.02]])
 """Standard deviations of the 13 parameters about their prediction, metres and radians (docs/conventions.md)."""
 
-# Steps of the numeric derivatives: about 1e-3 mm of film each.
-_STEPS: FloatArray = np.array([1.0] * 6 + [1e-6] * 6 + [1e-6])
 _LEAST_CONVEXITY = 9.0  # three standard deviations
 _CONVEXITY_STEP = 1.6  # [Yang2020] uses 1.4; methods differ little between 1.4 and 2
 
@@ -125,13 +124,5 @@ def refit_sigma_mm(
 
 
 def _derivatives(camera: PanoramicCamera, ground_m: FloatArray) -> FloatArray:
-    """Change of film points with the parameters, (N, 2, 13), mm per metre or radian."""
-    parameters = camera.parameters()
-    result = np.empty((len(ground_m), 2, 13))
-    for index, step in enumerate(_STEPS):
-        shift = np.zeros(13)
-        shift[index] = step
-        after = camera.with_parameters(parameters + shift).project(ground_m)
-        before = camera.with_parameters(parameters - shift).project(ground_m)
-        result[..., index] = (after - before) / (2 * step)
-    return result
+    """Change of film points with the parameters, (N, 2, 13), mm per metre or radian; NaN where they are not seen."""
+    return film_derivatives(camera, ground_m, camera.project(ground_m))[0]
