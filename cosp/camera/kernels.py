@@ -72,6 +72,85 @@ def project(
             x = 0.0
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def derivatives(
+    parameters: FloatArray,
+    focal_mm: float,
+    tau_per_mm: float,
+    ground_m: FloatArray,
+    imaged_mm: FloatArray,
+    by_all: FloatArray,
+) -> None:
+    """Derivatives of film points with respect to the 13 parameters and the ground point, as imaged.
+
+    x stands on both sides of x = f atan(-Nx/Nz), for N = R (X - C) is that of the time at which x is exposed.
+
+    Parameters
+    ----------
+    parameters, focal_mm, tau_per_mm, ground_m
+        As for `project`.
+    imaged_mm : (N, 2) array
+        What `project` fills.
+    by_all : (N, 2, 16) array
+        Filled; NaN where the film point is.
+    """
+    sign = 1.0 if tau_per_mm > 0 else -1.0
+    by_n = np.empty((16, 3))
+    turn = np.empty((3, 3))
+    n = np.empty(3)
+    for i in range(ground_m.shape[0]):
+        x = imaged_mm[i, 0]
+        tau = x * tau_per_mm
+        omega = parameters[6] + tau * parameters[9]
+        phi = parameters[7] + tau * parameters[10]
+        kappa = parameters[8] + tau * parameters[11]
+        so, co = math.sin(omega), math.cos(omega)
+        sp, cp = math.sin(phi), math.cos(phi)
+        sk, ck = math.sin(kappa), math.cos(kappa)
+        turn[0] = (cp * ck, co * sk + so * sp * ck, so * sk - co * sp * ck)
+        turn[1] = (-cp * sk, co * ck - so * sp * sk, so * ck + co * sp * sk)
+        turn[2] = (sp, -so * cp, co * cp)
+        dx = ground_m[i, 0] - parameters[0] - tau * parameters[3]
+        dy = ground_m[i, 1] - parameters[1] - tau * parameters[4]
+        dz = ground_m[i, 2] - parameters[2] - tau * parameters[5]
+        for r in range(3):
+            n[r] = turn[r, 0] * dx + turn[r, 1] * dy + turn[r, 2] * dz
+        for r in range(3):
+            for k in range(3):
+                by_n[k, r] = -turn[r, k]
+                by_n[3 + k, r] = -tau * turn[r, k]
+                by_n[13 + k, r] = turn[r, k]
+            # Omega turns first, about the world's x axis.
+            by_n[6, r] = turn[r, 1] * dz - turn[r, 2] * dy
+            by_n[12, r] = 0.0
+        # Phi turns about the y axis that kappa then turns to (sin kappa, cos kappa, 0): dN = -axis x N.
+        by_n[7] = (-ck * n[2], sk * n[2], ck * n[0] - sk * n[1])
+        # Kappa turns last, about the camera's z axis.
+        by_n[8] = (n[1], -n[0], 0.0)
+        by_n[9:12] = tau * by_n[6:9]
+
+        sine, cosine = math.sin(x / focal_mm), math.cos(x / focal_mm)
+        slope = n[1] / n[2]
+        # cos^2(alpha) = 1 / (1 + (Nx/Nz)^2)
+        x_by_n0, x_by_n2 = -focal_mm * cosine**2 / n[2], focal_mm * cosine**2 * n[0] / n[2] ** 2
+        y_by_n1, y_by_n2 = -focal_mm * cosine / n[2], focal_mm * cosine * slope / n[2]
+        x_by_tau = y_by_tau = 0.0
+        for k in range(3):
+            rate, speed = parameters[9 + k], parameters[3 + k]
+            x_by_tau += x_by_n0 * (rate * by_n[6 + k, 0] - speed * turn[0, k])
+            x_by_tau += x_by_n2 * (rate * by_n[6 + k, 2] - speed * turn[2, k])
+            y_by_tau += y_by_n1 * (rate * by_n[6 + k, 1] - speed * turn[1, k])
+            y_by_tau += y_by_n2 * (rate * by_n[6 + k, 2] - speed * turn[2, k])
+        motion = sign * parameters[12] * math.cos(parameters[6])
+        y_by_x = sine * slope - motion * cosine + tau_per_mm * y_by_tau
+        for k in range(16):
+            x_by = (x_by_n0 * by_n[k, 0] + x_by_n2 * by_n[k, 2]) / (1.0 - tau_per_mm * x_by_tau)
+            by_all[i, 0, k] = x_by
+            by_all[i, 1, k] = y_by_n1 * by_n[k, 1] + y_by_n2 * by_n[k, 2] + y_by_x * x_by
+        by_all[i, 1, 6] += sign * parameters[12] * math.sin(parameters[6]) * focal_mm * sine
+        by_all[i, 1, 12] -= sign * math.cos(parameters[6]) * focal_mm * sine
+
+
 @njit(nogil=True, cache=True, inline="always")
 def _weights(x: float, half: float, knot: float, intervals: int, cubic: bool) -> tuple[int, float, float, float, float]:
     """First spline and the values of the three or four uniform B-splines that are not zero at x."""
