@@ -115,6 +115,7 @@ def adjust_bundle(
             film_joints(path, film, camera, joint_sigma_px, block_sigma_px)
             for path, film, camera in zip(seams_paths, films, cameras, strict=True)
         ],
+        "bending_mm": [film["bending"]["sd_mm"] for film in films],
         "focal_sigma_mm": focal_sigma_mm if focal_length == "free" else None,
     }
 

@@ -103,6 +103,7 @@ def orient_block(
     film_groups: Sequence[int] | None = None,
     place_sigmas_m: Sequence[float] | None = None,
     joints: Sequence[Joints] | None = None,
+    bending_mm: Sequence[float] | None = None,
     focal_sigma_mm: float | None = None,
 ) -> OrientedBlock:
     """Adjusted cameras of a block.
@@ -138,6 +139,8 @@ def orient_block(
         How well each image was placed on the ground; used for those without control. NaN where that is not known.
     joints : sequence of Joints
         Of every film: where pieces of it may be off; only with film fields.
+    bending_mm : sequence of float
+        Standard deviation of the bending that straightening left of every film; only with film fields.
     focal_sigma_mm : float or None
         Standard deviation of the focal lengths, which are then unknowns too; None: they stay.
 
@@ -220,6 +223,7 @@ def orient_block(
         film_groups=film_groups,
         coupling=_with_lenses(information, film_groups, focal_sigma_mm),
         joints=joints,
+        bending_mm=bending_mm,
     )
     return OrientedBlock(_with_fields(calibration), tuple(resections), calibration, plain, focal_lengths_mm)
 
@@ -237,6 +241,7 @@ def with_checks(
     film_groups: Sequence[int] | None = None,
     place_sigmas_m: Sequence[float] | None = None,
     joints: Sequence[Joints] | None = None,
+    bending_mm: Sequence[float] | None = None,
     focal_sigma_mm: float | None = None,
 ) -> OrientedBlock:
     """The block adjusted once more with its check points as control and no height held out.
@@ -252,7 +257,7 @@ def with_checks(
         Per image.
     ties : sequence of Ties
     prior_cameras : sequence of PanoramicCamera
-    field, reference, gate_sigma, film_groups, place_sigmas_m, joints, focal_sigma_mm
+    field, reference, gate_sigma, film_groups, place_sigmas_m, joints, bending_mm, focal_sigma_mm
         As for `orient_block`.
     """
     if block.calibration is None:
@@ -273,6 +278,7 @@ def with_checks(
             _information(prior_cameras, control, film_groups, place_sigmas_m), film_groups, focal_sigma_mm
         ),
         joints=joints,
+        bending_mm=bending_mm,
         learned=block.calibration,
     )
     return replace(block, adjustment=_with_fields(calibration), calibration=calibration)
@@ -561,7 +567,7 @@ def _beliefs(block: OrientedBlock, focal_sigma_mm: float | None) -> list[dict[st
     if calibration is not None:
         steps = calibration.step_columns()
         variances = calibration.covariance[steps, steps]
-        moves = calibration.pattern_weights[:, calibration.basis.smooth :].ravel()
+        moves = calibration.pattern_weights[:, calibration.basis.count - calibration.basis.steps :].ravel()
         found.append(precision.belief_statistics("step", moves, variances, calibration.scales["step"]))
     if focal_sigma_mm is not None:
         # Those of one lens are one belief: each is told by itself here.

@@ -39,6 +39,7 @@ UNITS_LEARNED_FROM = 3  # pairs that tell length and amplitude of a large block
 SHARES = (0.0, 0.3, 0.6, 0.85, 0.95)
 FRAMES_TO_SHARE = 3  # of one camera, before a common part can be told from their own
 FRAMES_COMPARED = 4  # of each camera, to tell it
+ALONG_INFORMATION = 1e8  # of patterns of bending along the film, where there is none
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,8 @@ class Calibration:
         first = self.unknowns * (image + 1) - 2 * self.basis.count
         mine = slice(first, first + 2 * self.basis.count)
         covariance = pieces @ self.covariance[mine, mine] @ pieces.T
-        given = self.scales["step"] ** 2 * pieces[:, 2 * self.basis.smooth :] @ pieces[:, 2 * self.basis.smooth :].T
+        moves = pieces[:, 2 * (self.basis.count - self.basis.steps) :]
+        given = self.scales["step"] ** 2 * moves @ moves.T
         middle = np.kron(np.array([[0.5, 0.5]]), np.eye(2))
         found = []
         for k, x_mm in enumerate(field.steps.joints_mm):
@@ -204,6 +206,7 @@ def calibrate(
     film_groups: Sequence[int] | None = None,
     coupling: FloatArray | None = None,
     joints: Sequence[Joints] | None = None,
+    bending_mm: Sequence[float] | None = None,
     learned: Calibration | None = None,
 ) -> Calibration:
     """Film fields and cameras of a block that is already adjusted without them.
@@ -239,6 +242,8 @@ def calibrate(
         the focal lengths are unknowns too: P is 13 or 14.
     joints : sequence of Joints
         Of every film: where its pieces may be off. None are if left out.
+    bending_mm : sequence of float
+        Standard deviation of the bending that straightening left of every film; none if left out.
     learned : Calibration
         Of much the same block: its prior and scales are taken over.
 
@@ -259,7 +264,7 @@ def calibrate(
     )
     joints = [Joints() for _ in cameras] if joints is None else joints
     fields = [fieldprior.field_with_pieces(flat, own) for own in joints]
-    bases = {length: FieldBasis.of(fields, joints, length) for length in choices.lengths_mm}
+    bases = {length: FieldBasis.of(fields, joints, length, bending_mm) for length in choices.lengths_mm}
     information = np.zeros((PARAMETERS * len(cameras),) * 2) if coupling is None else coupling.copy()
     width = len(information) // len(cameras)
     for i, camera in enumerate(prior_cameras):
@@ -525,8 +530,12 @@ class _Block:
         information = self.information[np.ix_(mine, mine)]
         normal[np.ix_(cameras, cameras)] += information
         right[cameras] += information @ self.away[mine]
-        steps = _step_columns(len(images), self.unknowns + 2 * basis.count, basis)
+        width = self.unknowns + 2 * basis.count
+        steps = _step_columns(len(images), width, basis)
         normal[steps, steps] += 1.0 / self.scales["step"] ** 2
+        bends = width * np.arange(len(images))[:, None] + self.unknowns + 2 * (basis.smooth + np.arange(basis.bends))
+        normal[bends, bends] += ALONG_INFORMATION
+        normal[bends + 1, bends + 1] += 1.0
         return normal, right
 
     def _evidence(self, unit: Sequence[int], basis: FieldBasis) -> FloatArray:
@@ -610,7 +619,7 @@ class _Block:
             redundancy[group.kind] += residuals.size - taken / self.scales[group.kind] ** 2
             of_cells[group.kind].append(_cell_sums(equations, weight))
         steps = _step_columns(self.images, width, basis)
-        square["step"] += float((solved.pattern_weights[:, basis.smooth :] ** 2).sum())
+        square["step"] += float((solved.pattern_weights[:, basis.count - basis.steps :] ** 2).sum())
         redundancy["step"] += float((1.0 - solved.covariance[steps, steps] / self.scales["step"] ** 2).sum())
         scales = {}
         for kind in KINDS:
@@ -732,7 +741,7 @@ def _camera_columns(images: int, width: int, of_field: int) -> IntArray:
 def _step_columns(images: int, width: int, basis: FieldBasis) -> IntArray:
     """Which unknowns are weights of patterns that move pieces of film; they come last of an image."""
     last = width * np.arange(1, images + 1)[:, None]
-    return np.asarray((last - 2 * (basis.count - basis.smooth) + np.arange(2 * (basis.count - basis.smooth))).ravel())
+    return np.asarray((last - 2 * basis.steps + np.arange(2 * basis.steps)).ravel())
 
 
 def _factor(normal: FloatArray) -> tuple[tuple[FloatArray, bool], FloatArray]:

@@ -18,8 +18,13 @@ SMALLEST_MODE = 1e-4  # of the largest variance; smaller ones are left out: toge
 EXPECTED_AMPLITUDE_MM = 0.01
 AMPLITUDE_SPREAD = np.log(3.0)
 AMPLITUDES_MM = np.geomspace(1e-4, 0.1, 61)
-# Width over which pieces of film pass into each other: that of the band in which the pictures of two parts are blended.
+# Width over which pieces of film pass into each other: about that of the band in which two parts are blended.
 PASSAGE_MM = 3.0
+# Film bends sideways over a good part of its length, and opens across by a tenth of that. What straightening leaves
+# of it is a matter of the smooth process as long as it is small.
+BENDING_LENGTH_MM = 100.0
+BENDING_OPENS = 0.1
+LEAST_BENDING_MM = 0.02
 
 
 @dataclass(frozen=True)
@@ -91,29 +96,56 @@ class FieldBasis:
     ----------
     patterns : tuple of (F, K) arrays
         Of each film: how much of each function of its field is in a pattern, the same for both components.
-    smooth : int
-        How many of the patterns are those of the smooth process; the others move pieces of film and have unit variance.
+    smooth, bends : int
+        How many of the patterns, the first ones, are those of the smooth process, and how many of bending, which goes
+        across the film alone. The others move pieces of film. Those and bending have unit variance.
     """
 
     patterns: tuple[FloatArray, ...]
     smooth: int
+    bends: int = 0
 
     @classmethod
-    def of(cls, fields: Sequence[FilmField], joints: Sequence[Joints], length_mm: float) -> FieldBasis:
-        """Patterns for a correlation length; films with fewer pieces than others have patterns that do nothing."""
+    def of(
+        cls,
+        fields: Sequence[FilmField],
+        joints: Sequence[Joints],
+        length_mm: float,
+        bending_mm: Sequence[float] | None = None,
+    ) -> FieldBasis:
+        """Patterns for a correlation length; films with fewer pieces than others have patterns that do nothing.
+
+        Parameters
+        ----------
+        fields : sequence of FilmField
+            Of every film, on the same splines.
+        joints : sequence of Joints
+        length_mm : float
+        bending_mm : sequence of float
+            Standard deviation of the bending that straightening left; none if left out.
+        """
         waves = modes(replace(fields[0], steps=None), length_mm)
+        left_mm = np.zeros(len(fields)) if bending_mm is None else np.asarray(bending_mm)
+        left_mm = np.where(left_mm >= LEAST_BENDING_MM, left_mm, 0.0)
+        bends = bending_modes(fields[0]) if left_mm.any() else np.empty((len(waves), 0))
         # Both edges of a piece move by themselves.
         moves = [np.kron(own.root(), np.eye(2)) for own in joints]
         rows = max((field.functions for field in fields), default=0)
-        columns = waves.shape[1] + max(move.shape[1] for move in moves)
+        first = waves.shape[1] + bends.shape[1]
+        columns = first + max(move.shape[1] for move in moves)
         patterns = []
-        for field, move in zip(fields, moves, strict=True):
+        for field, move, bent_mm in zip(fields, moves, left_mm, strict=True):
             pattern = np.zeros((rows, columns))
-            pattern[: len(waves), : waves.shape[1]] = waves
+            pattern[: len(waves), :first] = np.hstack([waves, bent_mm * bends])
             if field.steps is not None:
-                pattern[len(waves) : field.functions, waves.shape[1] : waves.shape[1] + move.shape[1]] = move
+                pattern[len(waves) : field.functions, first : first + move.shape[1]] = move
             patterns.append(pattern)
-        return cls(tuple(patterns), waves.shape[1])
+        return cls(tuple(patterns), waves.shape[1], bends.shape[1])
+
+    @property
+    def steps(self) -> int:
+        """Number of patterns that move pieces of film."""
+        return self.count - self.smooth - self.bends
 
     @property
     def functions(self) -> int:
@@ -161,6 +193,17 @@ def modes(field: FilmField, length_mm: float) -> FloatArray:
     patterns = np.kron(along_vectors, across_vectors)[:, kept] * np.sqrt(variance[kept])
     splines, values = field.basis(np.zeros((1, 2)))
     return np.asarray(patterns / np.linalg.norm(values[0] @ patterns[splines[0]]))
+
+
+def bending_modes(field: FilmField) -> FloatArray:
+    """Patterns of spline coefficients (splines, M) of bending with a standard deviation of 1 mm."""
+    x, y = field.centres_mm()
+    covariance = np.exp(-0.5 * ((x[:, None] - x) / BENDING_LENGTH_MM) ** 2)
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > SMALLEST_MODE * values.max()
+    along = vectors[:, kept] * np.sqrt(values[kept])
+    across = np.column_stack([np.ones(len(y)), BENDING_OPENS * y / field.half_width_mm])
+    return np.kron(along, across)
 
 
 def log_evidence(normal: FloatArray, right: FloatArray) -> FloatArray:

@@ -64,6 +64,20 @@ class JoinedFilm:
         return self.smooth(film_mm) + (1.0 - share) * offsets[..., 0, :] + share * offsets[..., 1, :]
 
 
+class BentFilm:
+    """Film that was not straightened: bent across by three waves over its length, besides its smooth distortion."""
+
+    def __init__(self, rng, smooth, rms_mm):
+        self.smooth = smooth
+        size = rng.normal(size=3) / [1.0, 1.5, 2.0]
+        self.amplitude_mm = rms_mm * size / np.sqrt(np.mean(size**2) * 1.5)
+        self.phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+
+    def __call__(self, film_mm):
+        waves = np.sin(film_mm[..., :1] * np.pi * np.arange(1, 4) / HALF_LENGTH_MM + self.phase)
+        return self.smooth(film_mm) + np.stack([np.zeros(waves.shape[:-1]), waves @ self.amplitude_mm], axis=-1)
+
+
 def terrain_m(ground):
     """Ellipsoidal heights, 700 m about 1500 m."""
     east, north = ground[..., 0], ground[..., 1]
@@ -135,6 +149,7 @@ def simulate_pair(
     cameras=None,
     step_px=0.0,
     joint_px=0.0,
+    bending_mm=0.0,
 ):
     """Observations of a pair; every other block of 60 x 27 mm of film is held out as check points.
 
@@ -145,6 +160,8 @@ def simulate_pair(
     distortions = (FilmDistortion(rng, distortion_px), FilmDistortion(rng, distortion_px))
     if step_px:
         distortions = tuple(SteppedFilm(rng, smooth, step_px) for smooth in distortions)
+    if bending_mm:
+        distortions = tuple(BentFilm(rng, smooth, bending_mm) for smooth in distortions)
     if joint_px:
         distortions = tuple(
             JoinedFilm(rng, smooth, joints, joint_px) for smooth, joints in zip(distortions, JOINTS_MM, strict=True)

@@ -199,7 +199,10 @@ def run_script(folder, model):
         (folder / f"{camera.scene}_footprint.json").write_text(json.dumps({"camera": records.as_plain(camera)}))
         records.write(
             folder / f"{camera.scene}_film.json",
-            {"kind": "film", "version": 1, "pixel_mm": PIXEL_MM, "turned": camera is aft, "exposure": EXPOSURE},
+            {
+                **{"kind": "film", "version": 1, "pixel_mm": PIXEL_MM, "turned": camera is aft},
+                **{"exposure": EXPOSURE, "bending": {"sd_mm": 0.004}},
+            },
         )
         records.write(folder / f"{camera.scene}_seams.json", seams_record())
     ties = simulated.ties
