@@ -152,7 +152,8 @@ def match(
         raise ValueError(f"pictures of {left.shape[0]} and {right.shape[0]} rows: the same number is needed")
     cv2.setNumThreads(1)
     columns = left.shape[1]
-    wanted = Window(*(rows or (0, left.shape[0])), 0, columns)
+    first, end = rows or (0, left.shape[0])
+    wanted = Window(first, end, 0, columns)
     # Claims and islands look around a pixel, too.
     seen = wanted.grown(HALO_PX, left.shape)
     with ThreadPoolExecutor(threads) as pool:
@@ -219,7 +220,7 @@ def _coarse_to_fine(
     levels = passes[0].level
     lefts = picture_pyramid(np.ascontiguousarray(left), levels)
     rights = picture_pyramid(np.ascontiguousarray(right), levels)
-    needed = _needed(passes, wanted, [picture.shape for picture in lefts])
+    needed = _needed(passes, wanted, lefts)
     found: Float32Array | None = None
     level = levels
     for step, window_needed in zip(passes, needed, strict=True):
@@ -252,15 +253,15 @@ def _coarse_to_fine(
     return task
 
 
-def _needed(passes: list[Pass], wanted: Window, shapes: list[tuple[int, ...]]) -> list[Window]:
+def _needed(passes: list[Pass], wanted: Window, pictures: list[ByteArray]) -> list[Window]:
     """What each pass has to match for the last one to know all that it looks at in the window wanted."""
     windows = [wanted]
     for finer, step in zip(passes[:0:-1], passes[-2::-1], strict=True):
         ratio = 2 ** (step.level - finer.level)
-        window = windows[-1]
-        halved = Window(window.row0 // ratio, -(-window.row1 // ratio), 0, shapes[step.level][1])
+        rows, columns = pictures[step.level].shape
+        same = Window(windows[-1].row0 // ratio, -(-windows[-1].row1 // ratio), 0, columns)
         # A tile's halo at the finer level, and what a prior looks at beyond.
-        windows.append(halved.grown(HALO_PX // ratio + CONTEXT_PX, shapes[step.level][:2]))
+        windows.append(same.grown(HALO_PX // ratio + CONTEXT_PX, (rows, columns)))
     return windows[::-1]
 
 

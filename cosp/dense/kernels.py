@@ -1040,7 +1040,7 @@ def _add_threes(sums: Any, threes: Any) -> None:
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _window(threes: Any, column: int) -> int:
+def _window(threes: Any, column: int) -> Any:
     total = np.int32(0)
     for third in range(0, CORRELATED, 3):
         total = np.int32(total + np.int32(threes[column + third]))

@@ -139,7 +139,7 @@ def test_edges_of_the_films_are_not_matched_with_each_other(ground, slope, setti
     wrong = (found.validity == 0) & (np.abs(found.disparity - slope) > 1)
     assert (beyond[:, 60:]).sum() > 5000
     assert (found.validity[beyond] == 0).mean() < 0.002
-    assert wrong.mean() < 0.012  # the last columns before an edge lean on one side only
+    assert wrong.mean() < 0.01  # the last columns before an edge lean on one side only
 
 
 def test_swapping_the_pictures_only_changes_the_sign_of_disparity(pair, settings):
