@@ -96,6 +96,7 @@ rule mosaic_site:
                 "results/pairs/{pair}/hillshade.png",
                 "results/pairs/{pair}/dem_difference.png",
                 "results/pairs/{pair}/histogram.png",
+                "results/pairs/{pair}/disparity.png",
             ]
         ),
         y_parallaxes=of_pairs_of_site("results/pairs/{pair}/y_parallax.tif"),

@@ -309,6 +309,7 @@ def caption_of(path):
         "hillshade": "shaded relief of the DEM after coregistration",
         "dem_difference": "DEM after coregistration minus reference DEM; red is lower than the reference, blue higher",
         "histogram": "distribution of the differences before and after coregistration",
+        "disparity": "disparity of the dense matching, its confidence and similarity, on the rectified fore image",
     }
     return shown.get(Path(path).stem, Path(path).stem)
 

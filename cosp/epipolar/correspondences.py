@@ -99,7 +99,7 @@ def height_range(
 
 
 def virtual_conjugates(
-    fore: FilmMapping, aft: FilmMapping, heights_m: FloatArray, lattice: tuple[int, int] = (121, 17)
+    fore: FilmMapping, aft: FilmMapping, heights_m: FloatArray, lattice: tuple[int, int] = (121, 25)
 ) -> ConjugatePoints:
     """Conjugate points of rays on a lattice of each film, cut at each height and projected into the other film.
 

@@ -400,7 +400,8 @@ def fit_rectification(
 
     maps, inverse_fits = [], []
     for k, ahead in enumerate((0.0, aft_ahead)):
-        scaled_uv = _film_uv(films[k], directions[k], centres[k], halves[k])
+        # Beyond its points the polynomial runs away: there it need not be inverted. Tie points alone are too few.
+        scaled_uv = _film_uv(films[k], directions[k], centres[k], halves[k]) if measured else uvs[k] / halves[k]
         inverse, quality = _fit_inverse(polynomials[k], basis, halves[k], (row_low, row_high), scaled_uv)
         inverse_fits.append(quality)
         maps.append(
