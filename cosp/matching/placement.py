@@ -25,6 +25,7 @@ from cosp.geometry.frames import LocalFrame
 from cosp.geometry.rotations import angles_from_matrix, rotation_matrix
 from cosp.geometry.transforms import estimate_affine, ransac
 from cosp.matching.film_image import FilmImage
+from cosp.matching.filtering import consistent_by_tile
 from cosp.matching.footprint import FilmBlock, Footprint
 from cosp.matching.ground import (
     GroundMatches,
@@ -67,16 +68,14 @@ _MIN_BLOCKS = 2
 _SUN_TILES = 3
 # One posting to the next.
 _LEVEL_RATIO = 3.5
-_TEMPLATE_PX = 81
-_SEARCH_PX = 24
-_TILE_PX = 176
 _STEP_PX = 20
-_TILES_ALONG, _TILES_ACROSS = 24, 3
 # A camera fits any three tiles.
 _MIN_PLACES = 6
 _GATE_PX = 3.0
 # A place is taken without further search where at least this share of the matches agrees.
 _SURE_SHARE = 0.7
+# Matches of a place that is known agree, within so much, with so many others in their piece of the film.
+_PIECE_MM, _PIECE_GATE_PX, _PIECE_MATCHES, _PIECE_TRIALS = 40.0, 2.0, 6, 200
 # A film that lies as its camera says gives so many matches a tile; with fewer it is matched again through the fit.
 _MANY = 5.0
 _PASSES = 3
@@ -161,6 +160,35 @@ class SearchLimits:
 
 
 @dataclass(frozen=True)
+class _Templates:
+    """How many tiles of templates are matched along and across a film, how large templates are and how far they reach.
+
+    Parameters
+    ----------
+    along, across : int
+        Tiles; fewer across where a tile fills the film.
+    apart_px : int
+        Least distance of tiles across.
+    template_px, search_px, tile_px : int
+    min_score : float
+        Lax: agreement decides.
+    """
+
+    along: int
+    across: int
+    apart_px: int
+    template_px: int
+    search_px: int
+    tile_px: int
+    min_score: float
+
+
+# To find a place: what is large tells right from wrong. To know it well: what is small is at all ends of the film.
+_WIDE = _Templates(24, 3, 150, 81, 24, 176, 0.1)
+_NEAR = _Templates(48, 4, 50, 41, 14, 96, 0.15)
+
+
+@dataclass(frozen=True)
 class _Evidence:
     """Something to compare the film with."""
 
@@ -214,7 +242,7 @@ class _Placement:
     def places(self) -> int:
         """Tiles with matches that agree; those of one tile share most of their pixels and are one piece of evidence."""
         half = np.array([self.camera.half_length_mm, self.camera.half_width_mm])
-        cells = np.floor((self.matches.film_mm[self.agreeing] / half + 1) / 2 * [_TILES_ALONG, _TILES_ACROSS])
+        cells = np.floor((self.matches.film_mm[self.agreeing] / half + 1) / 2 * [_WIDE.along, _WIDE.across])
         return len(np.unique(cells, axis=0))
 
     def sigma_m(self, least_error_px: float) -> float:
@@ -386,6 +414,8 @@ class _Follower:
                 log.warning("the film stays as it was placed at %.0f m: %s", placement.posting_m, fault)
                 break
             placement = finer
+        if evidence.name == "relief":
+            placement = self._sharpened(way, evidence, placement)
         return self._record(best.candidate, evidence, placement, found.rival_score(best.candidate), margin)
 
     def _tried(self, guesses: Sequence[_Guess], posting_m: float) -> list[tuple[_Guess, _Evidence, _Placement]]:
@@ -424,7 +454,7 @@ class _Follower:
     def _settled(self, way: Way, evidence: _Evidence, placement: _Placement) -> _Placement:
         """The same place matched again through its fitted camera, while that brings matches that agree."""
         for _ in range(_PASSES):
-            if placement.agreeing.sum() > _MANY * len(_tiles(placement.camera, placement.posting_m)):
+            if placement.agreeing.sum() > _MANY * len(_tiles(placement.camera, placement.posting_m, _WIDE)):
                 break
             again = self._placed(way, placement.expected, placement.camera, evidence, placement.posting_m)
             if again.support <= 1.05 * placement.support:
@@ -448,6 +478,18 @@ class _Follower:
                 return best[0], found
         return evidence, placement
 
+    def _sharpened(self, way: Way, evidence: _Evidence, placement: _Placement) -> _Placement:
+        """The same place by small templates near where its camera says, that agree with their neighbours.
+
+        Relief shows so little of what film does that a large template at the foot of the mountains matches anywhere: a
+        few of these, all within the gate, bend an end of the film by kilometres.
+        """
+        near = self._placed(way, placement.expected, placement.camera, evidence, placement.posting_m, templates=_NEAR)
+        blocks = sum(block.agreeing > 0 for block in near.blocks())
+        enough = near.agreeing.sum() >= self.limits.min_agreeing and near.places() >= _MIN_PLACES
+        log.info("%d of %d matches near the place agree", near.agreeing.sum(), len(near.agreeing))
+        return near if enough and blocks >= _MIN_BLOCKS else placement
+
     def _placed(
         self,
         way: Way,
@@ -457,12 +499,13 @@ class _Follower:
         posting_m: float,
         *,
         every: int = 1,
+        templates: _Templates = _WIDE,
     ) -> _Placement:
         laid = self.film.laid(turned=way.turned, mirrored=way.mirrored)
         level = laid.reduced(reduction_for(posting_m, self.pixel_m))
         return _placed(
-            level, expected, camera, _tiles(camera, posting_m)[::every], evidence.on_grid, self.heights_on,
-            self.terrain.crs, posting_m, self.rng, self.threads,
+            level, expected, camera, _tiles(camera, posting_m, templates)[::every], templates, evidence.on_grid,
+            self.heights_on, self.terrain.crs, posting_m, self.rng, self.threads,
         )  # fmt: skip
 
     def _record(
@@ -651,11 +694,11 @@ def _film_mm_per_m(camera: PanoramicCamera, height_m: float) -> float:
     return 1.0 / ground_pixel_m(camera, 1.0, height_m)
 
 
-def _tiles(camera: PanoramicCamera, posting_m: float) -> FloatArray:
+def _tiles(camera: PanoramicCamera, posting_m: float, templates: _Templates) -> FloatArray:
     """Film points about which tiles of a posting are matched."""
     width_m = 2 * camera.half_width_mm / _film_mm_per_m(camera, 0.0)
-    rows = int(np.clip(round(width_m / posting_m / 150), 1, _TILES_ACROSS))
-    return film_lattice(camera.half_length_mm, camera.half_width_mm, _TILES_ALONG, rows)
+    rows = int(np.clip(round(width_m / posting_m / templates.apart_px), 1, templates.across))
+    return film_lattice(camera.half_length_mm, camera.half_width_mm, templates.along, rows)
 
 
 def _placed(
@@ -663,6 +706,7 @@ def _placed(
     expected: PanoramicCamera,
     camera: PanoramicCamera,
     tiles_mm: FloatArray,
+    templates: _Templates,
     reference_on: OnGrid,
     heights_on: OnGrid,
     crs: str,
@@ -680,12 +724,11 @@ def _placed(
         reference_on=reference_on,
         heights_on=heights_on,
         terrain=terrain,
-        # Scores and ratios are lax here: agreement with one camera decides.
-        matcher=structural(_TEMPLATE_PX, _SEARCH_PX, 0.1, 0.97, 1.5),
+        matcher=structural(templates.template_px, templates.search_px, templates.min_score, 0.97, 1.5),
         posting_m=posting_m,
-        tile_px=_TILE_PX,
+        tile_px=templates.tile_px,
         step_px=_STEP_PX,
-        margin_px=_TEMPLATE_PX // 2 + _SEARCH_PX,
+        margin_px=templates.template_px // 2 + templates.search_px,
         threads=threads,
     )
     nothing = np.zeros(len(matches), bool)
@@ -695,17 +738,28 @@ def _placed(
     pixel_mm = mm_per_m * posting_m
     predicted = camera.project(ground)
     seen = np.isfinite(predicted).all(axis=1)
-    _, first = ransac(
-        estimate_affine,
-        predicted[seen],
-        matches.film_mm[seen],
-        minimum=3,
-        gate=2 * _GATE_PX * pixel_mm,
-        trials=400,
-        rng=rng,
-    )
-    agreeing = nothing.copy()
-    agreeing[seen] = first
+    eligible = seen
+    if templates is _NEAR:
+        agreeing = eligible = consistent_by_tile(
+            predicted,
+            matches.film_mm,
+            tile_mm=_PIECE_MM,
+            gate_mm=_PIECE_GATE_PX * pixel_mm,
+            minimum=_PIECE_MATCHES,
+            trials=_PIECE_TRIALS,
+            rng=rng,
+        )
+    else:
+        agreeing = nothing.copy()
+        _, agreeing[seen] = ransac(
+            estimate_affine,
+            predicted[seen],
+            matches.film_mm[seen],
+            minimum=3,
+            gate=2 * _GATE_PX * pixel_mm,
+            trials=400,
+            rng=rng,
+        )
     if agreeing.sum() < 6:
         return _Placement(expected, camera, crs, matches, nothing, posting_m, float("nan"))
     fitted = camera
@@ -714,7 +768,7 @@ def _placed(
         sigma = np.full(int(agreeing.sum()), pixel_mm)
         fitted = refit_camera(fitted, matches.film_mm[agreeing], ground[agreeing], sigma, prior=expected).camera
         distance = np.nan_to_num(np.linalg.norm(matches.film_mm - fitted.project(ground), axis=1), nan=np.inf)
-        agreeing = distance <= _GATE_PX * pixel_mm
+        agreeing = eligible & (distance <= _GATE_PX * pixel_mm)
         if agreeing.sum() < 6:
             return _Placement(expected, camera, crs, matches, agreeing, posting_m, float("nan"))
     residual_m = float(np.median(distance[agreeing]) / mm_per_m)

@@ -10,8 +10,8 @@ from cosp.errors import PlacementError
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
 from cosp.matching.film_image import FilmImage
-from cosp.matching.ground import film_lattice, ground_pixel_m
-from cosp.matching.placement import SearchLimits, _placed, locate_film, turned_about_centre
+from cosp.matching.ground import ground_pixel_m
+from cosp.matching.placement import _NEAR, _WIDE, SearchLimits, _placed, _tiles, locate_film, turned_about_centre
 from cosp.matching.search import Candidate, Found, View, Way, _between, _evidence, _standardised
 
 from .conftest import CRS, FILM_PIXEL_MM, moved, texture
@@ -176,19 +176,23 @@ def test_views_reach_every_heading_and_scale():
     assert np.abs(wanted[:, None] - middles).min(axis=1).max() <= 2.5
 
 
-def test_an_end_that_shows_nothing_lies_where_the_prediction_says_whatever_an_earlier_fit_made_of_it(
-    camera, world, film
-):
+def one_end(film, shown):
+    """The film with something else beyond its middle."""
     pixels = film.read(Window(0, film.grid.shape[0], 0, film.grid.shape[1])).copy()
-    x_mm = film.grid.points(np.zeros(film.grid.shape[1]), np.arange(film.grid.shape[1]))[:, 0]
-    pixels[:, x_mm > 0] = 200
-    bent = camera.parameters()
-    bent[[3, 4, 11]] += [1500.0, 1500.0, np.radians(0.9)]
-    placed = _placed(
-        FilmImage.from_array(pixels, film.grid),
+    columns = np.arange(film.grid.shape[1])
+    beyond = film.grid.points(np.zeros(len(columns)), columns)[:, 0] > 0
+    pixels[:, beyond] = np.broadcast_to(shown, pixels.shape)[:, beyond]
+    return FilmImage.from_array(pixels, film.grid)
+
+
+def placed_by(film, expected, camera, world, templates):
+    """A camera fitted to the matches of a film."""
+    return _placed(
+        film,
+        expected,
         camera,
-        camera.with_parameters(bent),
-        film_lattice(camera.half_length_mm, camera.half_width_mm, 12, 1),
+        _tiles(camera, 80.0, templates),
+        templates,
         world.on(world.image),
         world.on(world.heights),
         CRS,
@@ -196,9 +200,28 @@ def test_an_end_that_shows_nothing_lies_where_the_prediction_says_whatever_an_ea
         np.random.default_rng(0),
         1,
     )
+
+
+def test_an_end_that_shows_nothing_lies_where_the_prediction_says_whatever_an_earlier_fit_made_of_it(
+    camera, world, film
+):
+    parameters = camera.parameters()
+    parameters[[3, 4, 11]] += [1500.0, 1500.0, np.radians(0.9)]
+    bent = camera.with_parameters(parameters)
+    placed = placed_by(one_end(film, 200), camera, bent, world, _WIDE)
     assert placed.agreeing.sum() > 12
-    assert film_error_px(camera.with_parameters(bent), camera).max() > 5
+    assert film_error_px(bent, camera).max() > 5
     assert film_error_px(placed.camera, camera).max() < 1
+
+
+def test_near_matches_count_where_their_neighbours_agree_and_not_by_chance(camera, world, film):
+    pixels = texture((film.grid.shape), np.random.default_rng(3)).astype(np.uint8)
+    placed = placed_by(one_end(film, pixels), camera, camera, world, _NEAR)
+    x_mm = placed.matches.film_mm[:, 0]
+    assert (x_mm > 20).sum() > 5
+    assert not placed.agreeing[x_mm > 20].any()
+    assert placed.agreeing[x_mm < -20].mean() > 0.9
+    assert film_error_px(placed.camera, camera).max() < 0.5
 
 
 @pytest.mark.slow
