@@ -308,8 +308,11 @@ def calibrate(
             " ".join(f"{kind} {scale:.2f}" for kind, scale in scales.items()),
             moved,
         )
-        if iteration >= to_learn and moved < SETTLED:
+        if (iteration >= to_learn and moved < SETTLED) or iteration + 1 == ITERATIONS:
             break
+        # A gigabyte or two in large blocks, before the next ones are built.
+        groups.clear()
+        solved = replace(solved, covariance=np.empty((0, 0)))
     solved = block.solve(basis, prior, film_groups, with_covariance=True)
     return _result(now, rows, weights, scales, prior, basis, block, solved, iteration + 1)
 

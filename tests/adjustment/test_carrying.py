@@ -82,7 +82,7 @@ def test_a_pair_without_control_is_carried_and_its_covariance_says_so(block):
     # Heights come from the reference with or without control.
     assert np.median(sigma) < 1.2 * np.median(beside)
     place = place_sigma_m(
-        carried.adjustment.cameras[2],
+        carried.adjustment.cameras,
         2,
         covariance=carried.adjustment.covariance,
         calibration=carried.calibration,

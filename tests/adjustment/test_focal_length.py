@@ -75,7 +75,9 @@ def simulated():
     return simulate_pair(np.random.default_rng(3), gcps=2000, ties=1500)
 
 
-@pytest.mark.parametrize("field", [None, replace(CHOICES, lengths_mm=(60.0,))])
+@pytest.mark.parametrize(
+    "field", [None, pytest.param(replace(CHOICES, lengths_mm=(60.0,)), marks=pytest.mark.slow)], ids=["plain", "field"]
+)
 def test_a_wrong_focal_length_is_put_right(simulated, field):
     found = adjusted(simulated, off_mm=-1.2, sigma_mm=SIGMA_MM, field=field).adjustment
     off_mm = np.array(
