@@ -17,6 +17,7 @@ from cosp.io import rasters, records
 from cosp.io.logs import log_to
 from cosp.surface.gridding import HALO_CELLS, CellPoints, boxes_meeting, grid_cells, map_boxes
 from cosp.surface.intersection import PixelIntersection
+from cosp.surface.orthophoto import film_of_cells
 
 CONFIDENCE_BAND = 2  # of validity.tif
 SMOOTH_BAND = 2  # of y_parallax.tif: the field that dense matching allowed for
@@ -116,14 +117,12 @@ def grid_dem(
         height_m, sigma_m, count = found.height_m[inner], found.sigma_m[inner], found.count[inner]
         camera_sigma_m = np.where(np.isfinite(height_m), np.float32(0), np.float32(np.nan))
         if of_cameras is not None:
-            centres = grid.window(tile.row0, tile.row1, tile.column0, tile.column1).centres()
-            camera_sigma_m = of_cameras.at(projector.film(centres[..., 0], centres[..., 1], height_m)).astype(
-                np.float32
-            )
+            cells = grid.window(tile.row0, tile.row1, tile.column0, tile.column1)
+            film_mm = film_of_cells(lambda xy, h: projector.film(xy[..., 0], xy[..., 1], h), cells, height_m)
+            camera_sigma_m = of_cameras.at(film_mm).astype(np.float32)
         return height_m, np.hypot(sigma_m, camera_sigma_m), count, camera_sigma_m
 
-    cells = int(np.clip(TILE_M / resolution_m, 64, 512))
-    every = tiles(grid.shape, cells)
+    every = tiles(grid.shape, int(np.clip(TILE_M / resolution_m, 64, 512)))
     # Along the shorter side first: neighbours in the order share windows of the points.
     if grid.shape[1] > grid.shape[0]:
         every.sort(key=lambda tile: (tile.column0, tile.row0))

@@ -16,6 +16,7 @@ from cosp.surface.orthophoto import (
     cells_below,
     direction_to_lens,
     fill_heights,
+    film_of_cells,
     film_window,
     heights_on,
     hidden_from_lens,
@@ -48,7 +49,9 @@ def orthorectify(
     grid, crs = dem.grid, dem.crs
     coarse = ellipsoidal_heights(reference_dem_path, grid.coarsened(COARSE), crs, reference_dem_heights)
     shift_m = median_shift(rasters.read_reduced(dem_path, COARSE), coarse)
-    highest_m = max(highest(dem_path, grid.shape), float(np.nanmax(coarse, initial=-np.inf)) + shift_m)
+    lowest_m, highest_m = height_range(dem_path, grid.shape)
+    lowest_m = min(lowest_m, float(np.nanmin(coarse, initial=np.inf)) + shift_m)
+    highest_m = max(highest_m, float(np.nanmax(coarse, initial=-np.inf)) + shift_m)
 
     def filled(window):
         """Heights of a window of the DEM, holes filled from the reference DEM."""
@@ -74,15 +77,15 @@ def orthorectify(
         part = ortho_grid.window(tile.row0, tile.row1, tile.column0, tile.column1)
         below = cells_below(grid, part)
         ground = grid.window(below.row0, below.row1, below.column0, below.column1)
-        heights_m = filled(below)
-        film_mm = film_of(part.centres(), heights_on(heights_m, ground, part))
+        directions = direction_to_lens(locate, ground, film_of)
+        around = below.grown(reach_of_occlusion(lowest_m, highest_m, *directions, grid), grid.shape)
+        heights_m = filled(around)
+        inside = below.inside(around)
+        film_mm = film_of_cells(film_of, part, heights_on(heights_m[inside.slices], ground, part))
         window = film_window(film_grid, film_mm)
         if window is None:
             return np.zeros(tile.shape, np.uint8)
-        directions = direction_to_lens(locate, ground, film_of)
-        reach = reach_of_occlusion(float(np.nanmin(heights_m)), highest_m, *directions, grid)
-        around = below.grown(reach, grid.shape)
-        hidden = hidden_from_lens(filled(around), below.inside(around), grid, *directions, tolerance_m=tolerance_m)
+        hidden = hidden_from_lens(heights_m, inside, grid, *directions, tolerance_m=tolerance_m)
         film = rasters.read(film_path, window=window)
         film_part = film_grid.window(window.row0, window.row1, window.column0, window.column1)
         return sample_film(film, film_part, film_mm, nearest_on(hidden, ground, part))
@@ -101,10 +104,14 @@ def orthorectify(
             log.info("exposed %d/%d tiles", min(start + threads, len(every)), len(every))
 
 
-def highest(dem_path, shape):
-    """Highest of the heights of a DEM, read by strips."""
-    strips = (Window(row, min(row + ROWS_AT_ONCE, shape[0]), 0, shape[1]) for row in range(0, shape[0], ROWS_AT_ONCE))
-    return max(float(np.nanmax(rasters.read(dem_path, window=strip), initial=-np.inf)) for strip in strips)
+def height_range(dem_path, shape):
+    """Lowest and highest of the heights of a DEM, read by strips."""
+    low, high = np.inf, -np.inf
+    for row in range(0, shape[0], ROWS_AT_ONCE):
+        heights_m = rasters.read(dem_path, window=Window(row, min(row + ROWS_AT_ONCE, shape[0]), 0, shape[1]))
+        low = min(low, float(np.nanmin(heights_m, initial=np.inf)))
+        high = max(high, float(np.nanmax(heights_m, initial=-np.inf)))
+    return low, high
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def _local_planes(values: FloatArray, weights: FloatArray, sigma: float) -> NDAr
     gauss = np.exp(-0.5 * (offset / sigma) ** 2)
     gauss /= gauss.sum()
 
-    def moments(field: FloatArray, highest: int) -> dict[tuple[int, int], NDArray[np.float64]]:
+    def moments(field: FloatArray, highest: int) -> dict[tuple[int, int], FloatArray]:
         """Sums about each node of field x row^i x column^j for i + j up to the highest order."""
         found = {}
         for i in range(highest + 1):

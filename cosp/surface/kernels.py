@@ -270,7 +270,7 @@ def count_by_cell(
         v = points[n, 1] + more_rows
         cell = -1
         if u >= zero and u < columns and v >= zero and v < rows and points[n, 3] > zero and not np.isnan(points[n, 2]):
-            cell = np.int32(v) * np.int32(shape[1]) + np.int32(u)
+            cell = int(v) * shape[1] + int(u)
             starts[cell + 1] += 1
         cells[n] = cell
 

@@ -14,6 +14,7 @@ from cosp.imaging.windows import Window
 from cosp.surface import kernels
 
 _NODE_CELLS = 32  # the direction to the lens changes by a millionth per metre: linear between such nodes
+_FILM_NODE_CELLS = 8  # film points are linear between such nodes to a hundredth of a pixel, at postings of 30 m too
 
 
 def direction_to_lens(
@@ -43,6 +44,45 @@ def direction_to_lens(
     step = (1 / _NODE_CELLS, 1 / _NODE_CELLS)
     east, north = (between_nodes(moved[..., i], (0.0, 0.0), step, grid.shape) for i in range(2))
     return east, north
+
+
+def film_of_cells(
+    film_mm: Callable[[FloatArray, FloatArray], FloatArray], grid: PixelGrid, heights_m: FloatArray
+) -> FloatArray:
+    """Film points of the cells of a grid on a surface, from those of a few cells at three heights.
+
+    Between nodes bilinear, in height a parabola through the lowest, the middle and the highest of the surface.
+
+    Parameters
+    ----------
+    film_mm : function
+        Film points (..., 2) of eastings and northings (..., 2) at ellipsoidal heights (...).
+    grid : PixelGrid
+    heights_m : array of the grid's shape
+        NaN gives NaN.
+
+    Returns
+    -------
+    (rows, columns, 2) array, mm
+    """
+    film = np.full((*grid.shape, 2), np.nan)
+    if not np.isfinite(heights_m).any():
+        return film
+    low, high = float(np.nanmin(heights_m)), float(np.nanmax(heights_m))
+    half = max((high - low) / 2, 1.0)
+    middle = (low + high) / 2
+    rows, columns = (np.arange(0, n + _FILM_NODE_CELLS, _FILM_NODE_CELLS) for n in grid.shape)
+    nodes = grid.points(rows[:, None], columns[None, :])
+    below, at, above = (film_mm(nodes, np.full(nodes.shape[:2], middle + k * half)) for k in (-1, 0, 1))
+    step = (1 / _FILM_NODE_CELLS, 1 / _FILM_NODE_CELLS)
+    part = (heights_m - middle) / half
+    for i in range(2):
+        constant, slope, bend = (
+            between_nodes(values[..., i], (0.0, 0.0), step, grid.shape)
+            for values in (at, (above - below) / 2, (above + below) / 2 - at)
+        )
+        film[..., i] = constant + part * (slope + part * bend)
+    return film
 
 
 def hidden_from_lens(

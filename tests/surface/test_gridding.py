@@ -132,6 +132,43 @@ def test_a_slope_turned_away_from_the_lens_has_no_holes(rng):
     assert np.abs(inner - plane(GRID.centres())[2:-2, 2:-2]).max() < 1.0
 
 
+@pytest.mark.parametrize("posting", [5.0, 7.5, 10.0, 20.0, 30.0])
+@pytest.mark.parametrize("facing", [1.0, 2.6])
+def test_any_posting_from_5_to_30_m_is_whole_and_says_how_well_it_is_known(posting, facing):
+    """Pixels of a 7 um film on a plane: 2.2 m apart, more along a slope that is turned away from the lens."""
+    rng = np.random.default_rng(round(posting * 10))
+    side = 900.0
+    i, j = np.meshgrid(np.arange(0, side, 2.2), np.arange(0, side, 2.2 * facing), indexing="ij")
+    turn = np.radians(12.0)  # rows of the film do not run along the map's
+    x = 600_000 + np.cos(turn) * j - np.sin(turn) * i
+    y = 5_200_000 + np.sin(turn) * j + np.cos(turn) * i
+    xy = np.stack([x, y], axis=-1).reshape(-1, 2) + rng.normal(0, 0.3, (x.size, 2))
+    points = np.concatenate([xy, plane(xy)[:, None]], axis=-1)
+    noise_m = 2.0
+    noisy = points + np.array([0.0, 0.0, 1.0]) * rng.normal(0, noise_m, len(points))[:, None]
+    grid = PixelGrid.covering((600_000, 5_200_200, 600_600, 5_200_700), posting)
+    choices = CHOICES | {"point_sigma_m": noise_m}
+    exact, found = (grid_points(each, grid, **choices) for each in (points, noisy))
+    # No holes wherever the whole cell lies among the points.
+    back = np.stack([np.cos(turn), np.sin(turn)]), np.stack([-np.sin(turn), np.cos(turn)])
+    centre = grid.centres() - np.array([600_000, 5_200_000])
+    depth = np.min([np.minimum(centre @ axis, side - centre @ axis) for axis in back], axis=0)
+    inside = depth > 2 * posting
+    inside[[0, -1]] = inside[:, [0, -1]] = False  # cells that are asked for without their neighbours
+    assert inside.mean() > 0.4
+    assert np.isfinite(found.height_m[inside]).all()
+    assert np.isfinite(found.sigma_m[inside]).all()
+    # What the plane itself leaves is little beside the noise.
+    assert np.abs((exact.height_m - plane(grid.centres())) / found.sigma_m)[inside].max() < 0.25
+    # Points of a cell: its area by that of a pixel.
+    expected = posting**2 / (2.2 * 2.2 * facing)
+    assert_allclose(found.count[inside].mean(), expected, rtol=0.05)
+    # The standard deviation is that of the errors, no more and no less.
+    ratio = ((found.height_m - plane(grid.centres())) / found.sigma_m)[inside]
+    assert 0.8 < ratio.std() < 1.25
+    assert abs(ratio.mean()) < 4 / np.sqrt(ratio.size / 4)
+
+
 def test_a_tiny_hole_is_filled_and_a_larger_one_is_not(rng):
     points = scattered(rng)
     rows, columns = (np.rint(v).astype(int) for v in GRID.pixels(points[:, :2]))

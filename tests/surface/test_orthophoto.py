@@ -13,6 +13,7 @@ from cosp.surface.orthophoto import (
     cells_below,
     direction_to_lens,
     fill_heights,
+    film_of_cells,
     film_window,
     heights_on,
     hidden_from_lens,
@@ -58,6 +59,25 @@ def exposed(fore, grid):
 
     ground = to_map.map_from_geodetic(ORIGIN.geodetic_from_local(fore.locate_on(film_mm, height_at, iterations=5)))
     return np.clip(np.rint(texture(ground[..., 0], ground[..., 1])), 1, 255).astype(np.uint8), projector
+
+
+@pytest.mark.parametrize(("posting", "shape"), [(10.0, (512, 500)), (30.0, (200, 333))])
+@pytest.mark.parametrize("along_mm", [0.0, -300.0])
+def test_film_points_of_cells_are_those_of_the_camera(fore, posting, shape, along_mm):
+    """Also far out on the film, over three kilometres of relief: to two hundredths of a 7 um pixel."""
+    projector = MapProjector(fore, CRS, (0, 0, 1, 1))
+    east, north, _ = projector.map_frame.map_from_geodetic(fore.locate_geodetic(np.array([along_mm, 0.0]), 1500.0))
+    grid = PixelGrid(float(east), float(north), posting, -posting, shape)
+    projector = MapProjector(fore, CRS, grid.bounds)
+    heights_m = np.random.default_rng(3).uniform(300, 3300, shape)
+    heights_m[5, 7:20] = np.nan
+    found = film_of_cells(lambda xy, h: projector.film(xy[..., 0], xy[..., 1], h), grid, heights_m)
+    centres = grid.centres()
+    expected = projector.film(centres[..., 0], centres[..., 1], heights_m)
+    assert np.array_equal(np.isnan(found), np.isnan(expected))
+    assert np.nanmax(np.abs(found - expected)) < 0.02 * 0.007
+    nowhere = film_of_cells(lambda xy, h: pytest.fail("nothing to ask for"), grid, np.full(shape, np.nan))
+    assert np.isnan(nowhere).all()
 
 
 def test_the_orthophoto_shows_the_texture_of_the_ground(exposed, grid):
