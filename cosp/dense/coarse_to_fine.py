@@ -21,7 +21,14 @@ from cosp.dense import kernels
 from cosp.dense.aggregation import aggregate_costs
 from cosp.dense.census import left_census, right_census
 from cosp.dense.memory import Workspace, workspace
-from cosp.dense.resampling import CONTEXT_PX, SmoothField, picture_pyramid, prior_of, resample_right
+from cosp.dense.resampling import (
+    CONTEXT_PX,
+    SmoothField,
+    continue_beyond_edges,
+    picture_pyramid,
+    prior_of,
+    resample_right,
+)
 from cosp.dense.selection import DisparityMap, select_disparities
 from cosp.dense.validity import Validity, correlation, doubly_claimed, no_data, picture_validity, speckles, uniqueness
 from cosp.imaging.windows import Window, tiles
@@ -249,6 +256,7 @@ def _coarse_to_fine(
         # The volume of a tile stays the same.
         size = tile_px if step.disparities == LEFT_OVER else 2 * tile_px // 3
         _over_tiles(keep, window_needed, size, pool)
+        continue_beyond_edges(coarse)
         found, level = coarse, step.level
     return task
 

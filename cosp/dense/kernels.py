@@ -1363,6 +1363,43 @@ def fill_from(values: Any, coarse: Any) -> None:
 
 
 @njit(nogil=True, cache=True)
+def continue_rows(values: Any, reach: int, base: int, steepest: float) -> None:
+    """Go on in a straight line from the first and the last value of every row into what is NaN beyond, in place.
+
+    The line is that of the outermost `base` columns and rises by at most `steepest` a column; rows that know less than
+    half of these columns stay as they are.
+    """
+    rows, columns = values.shape
+    for row in range(rows):
+        for step in (1, -1):
+            first = 0 if step == 1 else columns - 1
+            while 0 <= first < columns and np.isnan(values[row, first]):
+                first += step
+            count, sum_t, sum_v, sum_tt, sum_tv = 0, 0.0, 0.0, 0.0, 0.0
+            for t in range(base):
+                column = first + step * t
+                if not 0 <= column < columns:
+                    break
+                value = values[row, column]
+                if not np.isnan(value):
+                    count += 1
+                    sum_t += t
+                    sum_v += value
+                    sum_tt += t * t
+                    sum_tv += t * value
+            if count < 2 or 2 * count < base:
+                continue
+            slope = (count * sum_tv - sum_t * sum_v) / (count * sum_tt - sum_t * sum_t)
+            slope = min(max(slope, -steepest), steepest)
+            start = (sum_v - slope * sum_t) / count
+            for t in range(1, reach + 1):
+                column = first - step * t
+                if not 0 <= column < columns:
+                    break
+                values[row, column] = start - slope * t
+
+
+@njit(nogil=True, cache=True)
 def contested_rows(disparity: Any, apart: int, contested: Any) -> None:
     """Mark rows in which two left pixels, more than `apart` apart, share a pixel of the right picture or neighbours."""
     rows, columns = disparity.shape

@@ -20,6 +20,10 @@ _log = logging.getLogger(__name__)
 CONTEXT_PX = 8
 """What a prior looks at of the level before beyond its window, px of that level."""
 
+_EDGE_REACH_PX = 12  # of a coarse level, that a prior goes on beyond the outermost matches of a row
+_EDGE_BASE_PX = 24  # whose slope it takes for that
+_STEEPEST = 0.6  # pixels of disparity a pixel: ground that falls away from both cameras
+
 
 @dataclass(frozen=True)
 class SmoothField:
@@ -142,6 +146,15 @@ def fill_holes(values: Float32Array) -> Float32Array:
     for finer, coarser in zip(levels[-2::-1], levels[:0:-1], strict=True):
         kernels.fill_from(finer, coarser)
     return levels[0]
+
+
+def continue_beyond_edges(disparity: Float32Array) -> None:
+    """Let the disparity of every row go on beyond its first and last match as it slopes there, in place.
+
+    At film edges the next pass has nothing else to go by. Closed like other holes, from the mean of what is near, it
+    would be flat there, and pull matches near the edge inwards.
+    """
+    kernels.continue_rows(disparity, _EDGE_REACH_PX, _EDGE_BASE_PX, _STEEPEST)
 
 
 def median_of_given(disparity: Float32Array) -> Float32Array:

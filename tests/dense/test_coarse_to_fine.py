@@ -167,8 +167,9 @@ def test_y_parallax_given_brings_the_accuracy_back(ground, slope, pair, settings
     clean, _ = errors(pair, match(pair.left, pair.right, (0, 48), **settings))
     assert nmad(without) > 2.5 * nmad(clean)
     assert nmad(folded) < 1.8 * nmad(clean)  # between rows the right picture is interpolated, which blurs it
-    assert bad_share(without) > 0.05
-    assert bad_share(folded) < 1.3 * bad_share(clean)
+    assert bad_share(clean) < 0.001
+    assert bad_share(folded) < 0.002
+    assert bad_share(without) > 20 * bad_share(folded)
     assert density > 0.98
 
 
@@ -242,8 +243,8 @@ def test_confidence_is_lower_where_matches_are_wrong(ground, slope, settings):
 
     checked = match(grainy.left, grainy.right, (0, 48), **settings)
     kept = checked.validity == 0
-    assert (wrong & kept).sum() < 0.6 * wrong.sum()
-    assert (given & ~wrong & kept).sum() > 0.8 * (given & ~wrong).sum()
+    assert (wrong & kept).sum() < 0.7 * wrong.sum()
+    assert (wrong & ~kept).sum() / wrong.sum() > 10 * (given & ~wrong & ~kept).sum() / (given & ~wrong).sum()
 
 
 def test_the_range_searched_grows_by_levels_and_not_by_work():

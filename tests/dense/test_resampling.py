@@ -2,7 +2,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from cosp.dense.resampling import SmoothField, fill_holes, median_of_given, picture_pyramid, prior_of, resample_right
+from cosp.dense.resampling import (
+    SmoothField,
+    continue_beyond_edges,
+    fill_holes,
+    median_of_given,
+    picture_pyramid,
+    prior_of,
+    resample_right,
+)
 from cosp.imaging.windows import Window
 
 
@@ -49,6 +57,28 @@ def test_filling_keeps_what_is_given_and_bridges_a_slope():
 def test_a_map_without_any_disparity_cannot_be_filled():
     with pytest.raises(ValueError, match="no value"):
         fill_holes(np.full((4, 4), np.nan, np.float32))
+
+
+def test_beyond_the_outermost_matches_a_row_goes_on_as_it_slopes_there():
+    rows, columns = np.mgrid[:6, :120]
+    slope = 0.25 * columns - 3.0 * rows
+    disparity = slope.astype(np.float32)
+    disparity[:, :40] = disparity[:, 100:] = disparity[2, 60:64] = np.nan
+    disparity[4] = np.nan
+    disparity[4, 50:55] = 7.0  # too few to say how they slope
+    disparity[5, 40:] *= 8.0  # steeper than ground is
+    given = disparity.copy()
+    continue_beyond_edges(disparity)
+    known = ~np.isnan(given)
+    assert_array_equal(disparity[known], given[known])
+    assert_array_equal(np.isnan(disparity[2, 60:64]), True)
+    for row in (0, 1, 2, 3):
+        assert_allclose(disparity[row, 28:40], slope[row, 28:40], atol=1e-4)
+        assert_allclose(disparity[row, 100:112], slope[row, 100:112], atol=1e-4)
+        assert np.isnan(disparity[row, :28]).all()
+        assert np.isnan(disparity[row, 112:]).all()
+    assert_array_equal(disparity[4], given[4])
+    assert_allclose(np.diff(disparity[5, 28:40]), 0.6, atol=1e-4)
 
 
 def test_the_median_removes_single_outliers_and_leaves_holes():
