@@ -65,7 +65,7 @@ def rectify(
     log.info("terrain and margin: %.0f to %.0f m above the ellipsoid", low, high)
 
     rectification = fit_rectification(
-        virtual_conjugates(*films, np.linspace(low, high, LEVELS)),
+        virtual_conjugates(*films, np.linspace(low, high, LEVELS), even=bool(total_degree)),
         films,
         pixel_mm=pixel_mm,
         # Epipolar lines run across the film.

@@ -99,7 +99,12 @@ def height_range(
 
 
 def virtual_conjugates(
-    fore: FilmMapping, aft: FilmMapping, heights_m: FloatArray, lattice: tuple[int, int] = (121, 25)
+    fore: FilmMapping,
+    aft: FilmMapping,
+    heights_m: FloatArray,
+    lattice: tuple[int, int] = (121, 25),
+    *,
+    even: bool = True,
 ) -> ConjugatePoints:
     """Conjugate points of rays on a lattice of each film, cut at each height and projected into the other film.
 
@@ -111,6 +116,9 @@ def virtual_conjugates(
         Ellipsoidal heights that enclose the terrain.
     lattice : (along, across)
         Points of the lattice on each film.
+    even : bool
+        Else points are denser towards the edges, like Chebyshev nodes: polynomials of high degree swing between even
+        ones there.
 
     Raises
     ------
@@ -124,8 +132,8 @@ def virtual_conjugates(
     heights_m = np.asarray(heights_m, float)
     if heights_m.size < 2 or np.any(np.diff(heights_m) <= 0):
         raise ValueError(f"heights must rise and be two at least, got {heights_m}")
-    from_fore, to_aft, height_a, aft_directions = _transfer(fore, aft, heights_m, lattice)
-    from_aft, to_fore, height_b, fore_directions = _transfer(aft, fore, heights_m, lattice)
+    from_fore, to_aft, height_a, aft_directions = _transfer(fore, aft, heights_m, lattice, even)
+    from_aft, to_fore, height_b, fore_directions = _transfer(aft, fore, heights_m, lattice, even)
     if len(fore_directions) == 0 or len(aft_directions) == 0:
         raise NoOverlapError(
             f"the two films share no ground between {heights_m[0]:.0f} and {heights_m[-1]:.0f} m: "
@@ -179,11 +187,17 @@ def _residuals_of_map(source_mm: FloatArray, target_mm: FloatArray, degree: int)
     return np.asarray(residuals)
 
 
+def _towards_edges(film_mm: FloatArray, film: FilmMapping) -> FloatArray:
+    """An even lattice of film points with the spacing of Chebyshev nodes along both axes."""
+    half = np.array([film.half_length_mm, film.half_width_mm])
+    return np.asarray(half * np.sin(0.5 * np.pi * film_mm / half))
+
+
 def _transfer(
-    source: FilmMapping, target: FilmMapping, heights_m: FloatArray, lattice: tuple[int, int]
+    source: FilmMapping, target: FilmMapping, heights_m: FloatArray, lattice: tuple[int, int], even: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Points on the source film, their conjugates on the target, heights, and directions of the curves they draw."""
-    points = source.lattice(*lattice)
+    points = source.lattice(*lattice) if even else _towards_edges(source.lattice(*lattice), source)
     film = np.repeat(points[:, None], heights_m.size, axis=1)
     heights = np.broadcast_to(heights_m, film.shape[:2])
     seen = target.film_from_ground(source.ground_from_film(film, heights))

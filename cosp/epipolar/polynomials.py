@@ -54,10 +54,13 @@ class Fit:
     count: int
 
 
-def fit(basis: Basis, u: FloatArray, v: FloatArray, values: FloatArray) -> tuple[FloatArray, Fit]:
-    """Coefficients of the least-squares polynomial through values at points scaled to [-1, 1]."""
+def fit(
+    basis: Basis, u: FloatArray, v: FloatArray, values: FloatArray, weights: FloatArray | None = None
+) -> tuple[FloatArray, Fit]:
+    """Coefficients of the least-squares polynomial through values at points scaled to [-1, 1]; weights as roots."""
     design = basis.design(u, v)
-    solution, *_ = np.linalg.lstsq(design, values, rcond=None)
+    root = np.ones(len(values)) if weights is None else weights
+    solution, *_ = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)
     return basis.coefficients(solution), fit_quality(design @ solution - values)
 
 

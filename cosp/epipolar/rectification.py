@@ -13,7 +13,7 @@ from numpy.polynomial import chebyshev
 from cosp.arrays import Float32Array, FloatArray
 from cosp.epipolar import kernels
 from cosp.epipolar.correction import RowCorrection
-from cosp.epipolar.correspondences import ConjugatePoints, FilmMapping
+from cosp.epipolar.correspondences import ConjugatePoints, FilmMapping, virtual_conjugates
 from cosp.epipolar.directions import common_directions_rad
 from cosp.epipolar.polynomials import Basis, Fit, evaluate, fit, fit_quality, fit_row_functions
 from cosp.errors import NoOverlapError
@@ -24,6 +24,8 @@ from cosp.imaging.windows import Window
 
 # Polynomials are trusted this far beyond the conjugate points they were fitted to, as a part of half their range.
 _BEYOND = 0.02
+# Square root of the weight of conjugate points beyond the films, which only keep polynomials from running away there.
+_BEYOND_WEIGHT = 0.03
 # The inverse needs more terms than the polynomial it inverts; so many give 1e-4 px on whole films.
 _INVERSE_MORE = (3, 5)
 # The correction of rows changes by less than a hundredth of a pixel per pixel: each step gains two digits or more.
@@ -356,7 +358,8 @@ def fit_rectification(
     conjugates : ConjugatePoints
         Spread over the overlap and over the heights of the terrain.
     films : fore and aft FilmMapping
-        Only their extent is used.
+        Where conjugates are virtual, they tell a little of what lies beyond the films' edges, too: the corners of a
+        rectified image hold no film, and its polynomials must not run away there and come back.
     pixel_mm : float
         Pixel of the epipolar grid; the film's own keeps its resolution.
     basis : Basis
@@ -381,8 +384,13 @@ def fit_rectification(
         halves.append((float(half_u), float(half_v)))
 
     measured = bool(np.isnan(conjugates.height_m).all())
-    *polynomials, residuals = fit_row_functions(uvs[0], uvs[1], halves[0], halves[1], basis)
-    good = np.full(len(residuals), True)
+    count = len(conjugates.height_m)
+    beyond = [np.empty((0, 2))] * 2 if measured else _beyond_films(conjugates, films, directions, centres, halves)
+    weights = np.concatenate([np.ones(count), np.full(len(beyond[0]), _BEYOND_WEIGHT)])
+    fore_uv, aft_uv = (np.concatenate([uv, more * half]) for uv, more, half in zip(uvs, beyond, halves, strict=True))
+    *polynomials, residuals = fit_row_functions(fore_uv, aft_uv, halves[0], halves[1], basis, weights)
+    residuals = residuals[:count]
+    good = np.full(count, True)
     for _ in range(_ROBUST_STEPS if measured else 0):
         weights = tukey_weights(residuals / (1.4826 * float(np.median(np.abs(residuals)))))
         good = weights > 0
@@ -400,9 +408,9 @@ def fit_rectification(
 
     maps, inverse_fits = [], []
     for k, ahead in enumerate((0.0, aft_ahead)):
-        # Beyond its points the polynomial runs away: there it need not be inverted. Tie points alone are too few.
+        # Tie points alone are too few to be inverted at.
         scaled_uv = _film_uv(films[k], directions[k], centres[k], halves[k]) if measured else uvs[k] / halves[k]
-        inverse, quality = _fit_inverse(polynomials[k], basis, halves[k], (row_low, row_high), scaled_uv)
+        inverse, quality = _fit_inverse(polynomials[k], basis, halves[k], (row_low, row_high), scaled_uv, beyond[k])
         inverse_fits.append(quality)
         maps.append(
             EpipolarMap(
@@ -454,6 +462,31 @@ def fit_rectification(
     )
 
 
+def _beyond_films(
+    conjugates: ConjugatePoints,
+    films: tuple[FilmMapping, FilmMapping],
+    directions: tuple[float, float],
+    centres: list[FloatArray],
+    halves: list[tuple[float, float]],
+) -> list[FloatArray]:
+    """Conjugate points in the corners of both rectified images where there is no film, scaled to [-1, 1], (N, 2)."""
+    corners = (1 + _BEYOND) * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    wider = []
+    for film, direction, centre, half in zip(films, directions, centres, halves, strict=True):
+        reach = np.abs(centre + corners * half @ film_axes(direction).T).max(axis=0)
+        wider.append(replace(film, half_length_mm=float(reach[0]), half_width_mm=float(reach[1])))
+    heights = np.unique(conjugates.height_m)[[0, -1]]
+    found = virtual_conjugates(wider[0], wider[1], heights, even=False)
+    points = (found.fore_mm, found.aft_mm)
+    scaled = [
+        (film_mm - centre) @ film_axes(direction) / np.array(half)
+        for film_mm, direction, centre, half in zip(points, directions, centres, halves, strict=True)
+    ]
+    in_image = np.all([np.abs(uv) <= 1 + _BEYOND for uv in scaled], axis=(0, 2))
+    on_film = films[0].holds(points[0]) & films[1].holds(points[1])
+    return [uv[in_image & ~on_film] for uv in scaled]
+
+
 def _film_uv(film: FilmMapping, direction: float, centre: FloatArray, half: tuple[float, float]) -> FloatArray:
     """Points of a film's whole extent that its polynomial reaches, scaled to [-1, 1], (N, 2)."""
     uv = (film.lattice(201, 25) - centre) @ film_axes(direction) / np.array(half)
@@ -466,15 +499,18 @@ def _fit_inverse(
     half: tuple[float, float],
     row_range: tuple[float, float],
     scaled_uv: FloatArray,
+    beyond_uv: FloatArray,
 ) -> tuple[FloatArray, Fit]:
-    """Chebyshev coefficients of v (mm) as a function of u and row, and the error in rows (mm) at the same points."""
-    u, v = scaled_uv.T
+    """Chebyshev coefficients of v (mm) as a function of u and row, and the error in rows (mm) at points of the film."""
+    u, v = np.concatenate([scaled_uv, beyond_uv]).T
     row = evaluate(polynomial, u, v)
     scaled_row = (row - sum(row_range) / 2) / (row_range[1] - row_range[0]) * 2
     wider = Basis(basis.degree_u + _INVERSE_MORE[0], basis.degree_v + _INVERSE_MORE[1])
-    inverse, _ = fit(wider, u, scaled_row, v * half[1])
+    held = np.abs(scaled_row) <= 1 + _BEYOND
+    weights = np.concatenate([np.ones(len(scaled_uv)), np.full(len(beyond_uv), _BEYOND_WEIGHT)])
+    inverse, _ = fit(wider, u[held], scaled_row[held], v[held] * half[1], weights[held])
     back = evaluate(polynomial, u, evaluate(inverse, u, scaled_row) / half[1])
-    return inverse, fit_quality(back - row)
+    return inverse, fit_quality((back - row)[: len(scaled_uv)])
 
 
 def _range_over(rectification: Rectification, window: Window) -> tuple[float, float]:

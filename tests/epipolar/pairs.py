@@ -84,7 +84,7 @@ FILM_PIXEL_MM = 0.14
 def rectified(fore, aft, *, heights=(0.0, 1000.0, 2000.0, 3000.0), pixel_mm=0.007, basis=SEPARABLE, margin_px=0.0):
     """Conjugate points of a pair of cameras and their rectification."""
     films = (mapping(fore), mapping(aft))
-    conjugates = virtual_conjugates(*films, np.array(heights))
+    conjugates = virtual_conjugates(*films, np.array(heights), even=basis.total)
     return conjugates, fit_rectification(
         conjugates, films, pixel_mm=pixel_mm, basis=basis, disparity_margin_px=margin_px
     )

@@ -179,6 +179,28 @@ def with_fields(cameras, rng):
     return distorted
 
 
+def test_polynomials_of_high_degree_do_not_run_away_where_the_images_hold_no_film(rng):
+    _, rectification = rectified(*with_fields(table_pair("1112"), rng), basis=Basis(10, 48))
+    rows, columns = (
+        np.linspace(0, size - 1, count) for size, count in zip(rectification.shape, (301, 41), strict=True)
+    )
+    low, high = rectification.disparity_bounds(rows[:, None], columns[None, :])
+    assert np.isfinite(low).all()
+    range_px = np.ptp(rectification.disparity_range_px)
+    assert (high - low).max() < 1.2 * range_px
+    for film in (rectification.fore, rectification.aft):
+        film_mm = film.film(rows[:, None], columns[None, :])
+        known = np.isfinite(film_mm[..., 0])
+        assert known.mean() > 0.8
+        back_rows, _ = film.epipolar(film_mm)
+        away = np.abs(back_rows - rows[:, None])[known & np.isfinite(back_rows)]
+        assert (away > 0.2).mean() < 0.002
+        # Places a row apart on the image lie as far apart on the film everywhere.
+        step = np.linalg.norm(np.diff(film_mm, axis=0), axis=-1)
+        assert 0.9 * np.nanmedian(step) < np.nanmin(step)
+        assert np.nanmax(step) < 1.1 * np.nanmedian(step)
+
+
 def test_a_film_field_of_the_cameras_is_followed_by_higher_degrees(rng):
     pair = with_fields(table_pair("1112"), rng)
     heights = (0.0, 2000.0, 4000.0, 6000.0)
