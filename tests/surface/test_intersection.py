@@ -121,6 +121,20 @@ def test_a_table_is_refused_for_rays_that_bend_between_its_nodes(pair):
         )
 
 
+def test_a_few_cells_in_which_rays_bend_are_left_out(pair):
+    def bent_at_the_end(place):
+        film_mm = film_of(place)
+        beyond = np.maximum(place[..., 1:] - 7950.0, 0.0) * 1e-4
+        return pair[0].rays(film_mm + beyond**2)
+
+    nodes = nodes_over((-500, -8000), (500, 8000), spacing_px=50.0)
+    straight = tabulate_rays(lambda place: pair[0].rays(film_of(place)), nodes, largest_error_rad=1.0)
+    table = tabulate_rays(bent_at_the_end, nodes, largest_error_rad=1e-8)
+    assert np.isfinite(straight.values).all()
+    assert np.isnan(table.values[-1]).all()
+    assert_allclose(table.values[:-2], straight.values[:-2], atol=1e-12)
+
+
 def test_a_table_takes_any_camera_whose_rays_are_smooth():
     def frame_camera(film_mm):  # a frame camera: one station, central projection
         direction = np.concatenate([film_mm, np.full((*film_mm.shape[:-1], 1), -300.0)], axis=-1)
