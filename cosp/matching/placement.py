@@ -75,7 +75,7 @@ _GATE_PX = 3.0
 # A place is taken without further search where at least this share of the matches agrees.
 _SURE_SHARE = 0.7
 # Matches of a place that is known agree, within so much, with so many others in their piece of the film.
-_PIECE_MM, _PIECE_GATE_PX, _PIECE_MATCHES, _PIECE_TRIALS = 40.0, 2.0, 6, 200
+_PIECE_MM, _PIECE_GATE_PX, _PIECE_MATCHES, _PIECE_TRIALS = 40.0, 2.0, 12, 200
 # A film that lies as its camera says gives so many matches a tile; with fewer it is matched again through the fit.
 _MANY = 5.0
 _PASSES = 3
