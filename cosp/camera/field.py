@@ -166,13 +166,13 @@ class FilmField:
     def distorted(self, film_mm: FloatArray) -> FloatArray:
         """Where film points (..., 2) in mm that the camera images are measured."""
         film = np.array(film_mm, dtype=float, order="C")
-        kernels.distort(self.coefficients, *self._domain, *self._pieces, film.reshape(-1, 2))
+        kernels.distort(self.coefficients, self._domain, self._pieces, film.reshape(-1, 2))
         return film
 
     def corrected(self, film_mm: FloatArray) -> FloatArray:
         """Where the camera images film points (..., 2) in mm that were measured: the inverse of `distorted`."""
         film = np.array(film_mm, dtype=float, order="C")
-        kernels.correct(self.coefficients, *self._domain, *self._pieces, film.reshape(-1, 2))
+        kernels.correct(self.coefficients, self._domain, self._pieces, film.reshape(-1, 2))
         return film
 
     def basis(self, film_mm: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -191,15 +191,14 @@ class FilmField:
         film = np.ascontiguousarray(film_mm, dtype=float)
         functions = np.empty((len(film), ALONG * ACROSS + (4 if self.steps else 0)), dtype=np.int64)
         values = np.empty(functions.shape)
-        joints, width, _ = self._pieces
-        kernels.splines_at(self.shape[0], self.shape[1], *self._domain, joints, width, film, functions, values)
+        kernels.splines_at(*self.shape, self._domain, self._pieces, film, functions, values)
         return functions, values
 
     def gradient(self, film_mm: FloatArray) -> FloatArray:
         """Derivatives of the displacement with respect to x and y, (N, 2, 2), the direction last."""
         film = np.ascontiguousarray(film_mm, dtype=float)
         gradient = np.empty((len(film), 2, 2))
-        kernels.field_gradient(self.coefficients, *self._domain, *self._pieces, film, gradient)
+        kernels.field_gradient(self.coefficients, self._domain, self._pieces, film, gradient)
         return gradient
 
     def turned(self) -> FilmField:
@@ -212,12 +211,12 @@ class FilmField:
         return 2.0 * self.half_length_mm / self.intervals[0], 2.0 * self.half_width_mm / self.intervals[1]
 
     @property
-    def _domain(self) -> tuple[float, float, float, float]:
+    def _domain(self) -> kernels.Domain:
         """Half the film and the distance of knots, as the kernels take them."""
         return self.half_length_mm, self.half_width_mm, *self._knot_mm
 
     @cached_property
-    def _pieces(self) -> tuple[FloatArray, float, FloatArray]:
+    def _pieces(self) -> kernels.Pieces:
         """Joints, width of the passage and offsets, as the kernels take them; no joints where there are no steps."""
         if self.steps is None:
             return np.empty(0), 1.0, np.zeros((1, 2, 2))

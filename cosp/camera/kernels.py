@@ -9,6 +9,9 @@ from numba import njit
 
 from cosp.arrays import FloatArray, IntArray
 
+Domain = tuple[float, float, float, float]
+Pieces = tuple[FloatArray, float, FloatArray]
+
 MAX_SCAN_ANGLE_RAD = math.radians(40.0)  # no lens of these cameras sweeps further
 
 
@@ -170,30 +173,33 @@ def _weights(x: float, half: float, knot: float, intervals: int, cubic: bool) ->
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _piece(joints: FloatArray, width: float, x: float) -> tuple[int, float, float]:
-    """Piece of film at x, how far it has passed into the next one, 0 to 1, and how fast it does, per mm."""
+def _piece(joints: FloatArray, width: float, x: float) -> tuple[int, int, float, float]:
+    """Piece of film at x, the next, how far one has passed into the other, 0 to 1, and how fast it does, per mm."""
     p = 0
     while p < joints.shape[0] and x >= joints[p] + 0.5 * width:
         p += 1
+    following = min(p + 1, joints.shape[0])
     if p < joints.shape[0] and x > joints[p] - 0.5 * width:
         u = (x - joints[p]) / width + 0.5
-        return p, u * u * u * (u * (6.0 * u - 15.0) + 10.0), 30.0 * (u * (1.0 - u)) ** 2 / width
-    return p, 0.0, 0.0
+        return p, following, u * u * u * (u * (6.0 * u - 15.0) + 10.0), 30.0 * (u * (1.0 - u)) ** 2 / width
+    return p, following, 0.0, 0.0
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _part_across(half: float, y: float) -> float:
+    """Part of the way from the lower edge of the film to the upper one."""
+    return min(max((y + half) / (2.0 * half), 0.0), 1.0)
 
 
 @njit(nogil=True, cache=True, inline="always")
 def _displacement(
     table: FloatArray,
-    half_x: float,
-    half_y: float,
-    knot_x: float,
-    knot_y: float,
-    joints: FloatArray,
-    width: float,
-    offsets: FloatArray,
+    domain: Domain,
+    pieces: Pieces,
     x: float,
     y: float,
 ) -> tuple[float, float]:
+    half_x, half_y, knot_x, knot_y = domain
     i, a0, a1, a2, a3 = _weights(x, half_x, knot_x, table.shape[0] - 3, True)
     j, b0, b1, b2, _ = _weights(y, half_y, knot_y, table.shape[1] - 2, False)
     dx = 0.0
@@ -203,11 +209,11 @@ def _displacement(
         row = table[i + k]
         dx += a * (b0 * row[j, 0] + b1 * row[j + 1, 0] + b2 * row[j + 2, 0])
         dy += a * (b0 * row[j, 1] + b1 * row[j + 1, 1] + b2 * row[j + 2, 1])
+    joints, width, offsets = pieces
     if joints.shape[0] > 0:
-        p, t, _ = _piece(joints, width, x)
-        v = min(max((y + half_y) / (2.0 * half_y), 0.0), 1.0)
-        here = offsets[p]
-        following = offsets[min(p + 1, joints.shape[0])]
+        p, following_p, t, _ = _piece(joints, width, x)
+        v = _part_across(half_y, y)
+        here, following = offsets[p], offsets[following_p]
         dx += (1.0 - t) * ((1.0 - v) * here[0, 0] + v * here[1, 0])
         dy += (1.0 - t) * ((1.0 - v) * here[0, 1] + v * here[1, 1])
         dx += t * ((1.0 - v) * following[0, 0] + v * following[1, 0])
@@ -218,13 +224,8 @@ def _displacement(
 @njit(nogil=True, cache=True)
 def distort(
     table: FloatArray,
-    half_x: float,
-    half_y: float,
-    knot_x: float,
-    knot_y: float,
-    joints: FloatArray,
-    width: float,
-    offsets: FloatArray,
+    domain: Domain,
+    pieces: Pieces,
     film_mm: FloatArray,
 ) -> None:
     """Add the displacement of a film field to film points (N, 2), in place; NaN stays.
@@ -233,20 +234,17 @@ def distort(
     ----------
     table : (along, across, 2) array
         Coefficients of the splines.
-    half_x, half_y, knot_x, knot_y : float
+    domain : (half_x, half_y, knot_x, knot_y)
         Half the film that they cover, and the distance of their knots.
-    joints : (J,) array
-        Where pieces of film meet, rising.
-    width : float
-        Over which one piece passes into the next.
-    offsets : (J + 1, 2, 2) array
-        Of each piece at the lower and the upper edge of the film, the component last.
+    pieces : (joints, width, offsets)
+        Where pieces of film meet, rising, (J,); over which one passes into the next; and of each at the lower and the
+        upper edge of the film, (J + 1, 2, 2), the component last.
     film_mm : (N, 2) array
     """
     for n in range(film_mm.shape[0]):
         x, y = film_mm[n, 0], film_mm[n, 1]
         if x == x and y == y:
-            dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, joints, width, offsets, x, y)
+            dx, dy = _displacement(table, domain, pieces, x, y)
             film_mm[n, 0] = x + dx
             film_mm[n, 1] = y + dy
 
@@ -254,13 +252,8 @@ def distort(
 @njit(nogil=True, cache=True)
 def correct(
     table: FloatArray,
-    half_x: float,
-    half_y: float,
-    knot_x: float,
-    knot_y: float,
-    joints: FloatArray,
-    width: float,
-    offsets: FloatArray,
+    domain: Domain,
+    pieces: Pieces,
     film_mm: FloatArray,
 ) -> None:
     """Undo `distort`, in place: a fixed point that gains three digits a step, for the field changes slowly."""
@@ -269,7 +262,7 @@ def correct(
         if measured_x == measured_x and measured_y == measured_y:
             x, y = measured_x, measured_y
             for _ in range(8):
-                dx, dy = _displacement(table, half_x, half_y, knot_x, knot_y, joints, width, offsets, x, y)
+                dx, dy = _displacement(table, domain, pieces, x, y)
                 change = abs(measured_x - dx - x) + abs(measured_y - dy - y)
                 x = measured_x - dx
                 y = measured_y - dy
@@ -283,12 +276,8 @@ def correct(
 def splines_at(
     along: int,
     across: int,
-    half_x: float,
-    half_y: float,
-    knot_x: float,
-    knot_y: float,
-    joints: FloatArray,
-    width: float,
+    domain: Domain,
+    pieces: Pieces,
     film_mm: FloatArray,
     splines: IntArray,
     values: FloatArray,
@@ -297,6 +286,8 @@ def splines_at(
 
     The last four are the two edges of a piece of film and of the next one, counted after the splines.
     """
+    half_x, half_y, knot_x, knot_y = domain
+    joints, width, _ = pieces
     for n in range(film_mm.shape[0]):
         x, y = film_mm[n, 0], film_mm[n, 1]
         if not (x == x and y == y):
@@ -311,10 +302,10 @@ def splines_at(
                 splines[n, 3 * k + m] = (i + k) * across + j + m
                 values[n, 3 * k + m] = a * (b0 if m == 0 else b1 if m == 1 else b2)
         if joints.shape[0] > 0:
-            p, t, _ = _piece(joints, width, x)
-            v = min(max((y + half_y) / (2.0 * half_y), 0.0), 1.0)
+            p, following_p, t, _ = _piece(joints, width, x)
+            v = _part_across(half_y, y)
             for k in range(2):
-                piece = min(p + k, joints.shape[0])
+                piece = following_p if k == 1 else p
                 share = t if k == 1 else 1.0 - t
                 splines[n, 12 + 2 * k] = along * across + 2 * piece
                 splines[n, 13 + 2 * k] = along * across + 2 * piece + 1
@@ -325,17 +316,14 @@ def splines_at(
 @njit(nogil=True, cache=True)
 def field_gradient(
     table: FloatArray,
-    half_x: float,
-    half_y: float,
-    knot_x: float,
-    knot_y: float,
-    joints: FloatArray,
-    width: float,
-    offsets: FloatArray,
+    domain: Domain,
+    pieces: Pieces,
     film_mm: FloatArray,
     gradient: FloatArray,
 ) -> None:
     """Derivatives (N, 2, 2) of the displacement, component and direction, at film points (N, 2)."""
+    half_x, half_y, knot_x, knot_y = domain
+    joints, width, offsets = pieces
     intervals_x, intervals_y = table.shape[0] - 3, table.shape[1] - 2
     da = np.empty(4)
     db = np.empty(3)
@@ -369,11 +357,10 @@ def field_gradient(
             gradient[n, c, 0] = by_x * scale_x
             gradient[n, c, 1] = by_y * scale_y
         if joints.shape[0] > 0:
-            p, t, slope = _piece(joints, width, x)
-            share = min(max((y + half_y) / (2.0 * half_y), 0.0), 1.0)
+            p, following_p, t, slope = _piece(joints, width, x)
+            share = _part_across(half_y, y)
             across = 1.0 / (2.0 * half_y) if abs(y) <= half_y else 0.0
-            here = offsets[p]
-            following = offsets[min(p + 1, joints.shape[0])]
+            here, following = offsets[p], offsets[following_p]
             for c in range(2):
                 change_0 = following[0, c] - here[0, c]
                 change_1 = following[1, c] - here[1, c]
