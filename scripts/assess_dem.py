@@ -107,8 +107,9 @@ def assess_dem(
             after_m, difference_m, cells = examined(strip)
             differences.write(strip, difference_m)
             gathered.append(cells)
-            after_thinned.append(after_m[::factor, ::factor])
-            difference_thinned.append(difference_m[::factor, ::factor])
+            # Copies: a view would hold on to the whole strip.
+            after_thinned.append(after_m[::factor, ::factor].copy())
+            difference_thinned.append(difference_m[::factor, ::factor].copy())
     cells = {name: np.concatenate([strip.pop(name) for strip in gathered]) for name in list(gathered[0])}
     everything = np.ones(len(cells["slope"]), bool)
 

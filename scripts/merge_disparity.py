@@ -60,8 +60,8 @@ def merge_disparity(
                 for number, values in enumerate(bands, start=1):
                     validity_file.write(window, values, number)
                 validity_counts += np.bincount(bands[0].ravel(), minlength=256)
-                sampled = (slice(None, None, sampled_every), slice(None, None, sampled_every))
-                samples.append((disparity[sampled], bands[1][sampled], bands[2][sampled]))
+                # Copies: a view would hold on to the rows it was taken from, and with them to the whole film.
+                samples.append([one[::sampled_every, ::sampled_every].copy() for one in (disparity, *bands[1:])])
             row += header.shape[0]
 
     disparity, confidence, similarity = (np.concatenate(parts) for parts in zip(*samples, strict=True))

@@ -1,4 +1,5 @@
 import importlib.util
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from cosp.dense.coarse_to_fine import match
 from cosp.geometry.grids import PixelGrid
+from cosp.imaging.windows import Window
 from cosp.io import rasters, records
 from tests.dense.synthetic import render, texture
 
@@ -82,3 +84,24 @@ def test_strips_join_to_what_the_whole_gives(folder, settings):
     summary = records.read_json(folder / "disparity.json")
     assert_allclose(summary["density"], (validity == 0).sum() / ((validity & 3) == 0).sum())
     assert_allclose(summary["disparity_px"]["median"], np.nanmedian(disparity), atol=0.3)
+
+
+def test_joining_strips_of_a_long_film_takes_no_more_memory_than_a_few_of_their_rows(tmp_path):
+    grid, rows = PixelGrid(0, 0, 1, 1, (16384, 1500)), np.arange(16384, dtype=np.float32)[:, None]
+    disparity = np.broadcast_to(rows % 50, grid.shape).astype(np.float32)
+    rasters.write(tmp_path / "strip.tif", disparity, grid=grid, crs=rasters.PIXEL_CRS)
+    validity = np.full((3, *grid.shape), 200, np.uint8)
+    rasters.write(tmp_path / "strip_validity.tif", validity, grid=grid, crs=rasters.PIXEL_CRS)
+    whole = disparity.nbytes + validity.nbytes
+    del disparity, validity
+    tracemalloc.start()
+    function_of("merge_disparity")(
+        [tmp_path / "strip.tif"],
+        [tmp_path / "strip_validity.tif"],
+        *(tmp_path / name for name in ("disparity.tif", "validity.tif", "disparity.json", "disparity.png")),
+        title="long",
+    )
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 0 < peak < whole / 2
+    assert_array_equal(rasters.read(tmp_path / "disparity.tif", window=Window(5000, 5001, 0, 1500))[0], 0.0)
