@@ -49,7 +49,7 @@ rule merge_disparity:
         "benchmarks/merge_disparity/{pair}.jsonl"
     conda:
         "../envs/cosp.yaml"
-    threads: 1
+    threads: 2
     resources:
         mem_mb=memory(1),
         runtime=runtime(0.1),

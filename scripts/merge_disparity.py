@@ -1,5 +1,6 @@
 """Join the strips of a pair's dense matching into one disparity and one validity raster, with a picture of both."""
 
+import cv2
 import numpy as np
 
 from cosp.dense.validity import summarise_disparity
@@ -16,7 +17,7 @@ LONGEST_PICTURE_PX = 4000
 
 
 def merge_disparity(
-    disparity_strips, validity_strips, disparity_path, validity_path, summary_path, figure_path, *, title
+    disparity_strips, validity_strips, disparity_path, validity_path, summary_path, figure_path, *, title, threads=1
 ):
     # Rows of the strips step the same way, so the order along y is the order of rows.
     ordered = sorted(
@@ -38,6 +39,7 @@ def merge_disparity(
             grid=grid,
             crs=top.crs,
             descriptions=("disparity",),
+            threads=threads,
         ) as disparity_file,
         rasters.create(
             validity_path,
@@ -47,6 +49,7 @@ def merge_disparity(
             crs=top.crs,
             count=3,
             descriptions=("validity", "confidence", "similarity"),
+            threads=threads,
         ) as validity_file,
     ):
         row = 0
@@ -59,7 +62,7 @@ def merge_disparity(
                 disparity_file.write(window, disparity)
                 for number, values in enumerate(bands, start=1):
                     validity_file.write(window, values, number)
-                validity_counts += np.bincount(bands[0].ravel(), minlength=256)
+                validity_counts += cv2.calcHist([bands[0]], [0], None, [256], [0, 256]).ravel().astype(np.int64)
                 # Copies: a view would hold on to the rows it was taken from, and with them to the whole film.
                 samples.append([one[::sampled_every, ::sampled_every].copy() for one in (disparity, *bands[1:])])
             row += header.shape[0]
@@ -80,4 +83,5 @@ if __name__ == "__main__":
             summary_path=snakemake.output.summary,
             figure_path=snakemake.output.figure,
             title=snakemake.wildcards.pair,
+            threads=snakemake.threads,
         )

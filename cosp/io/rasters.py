@@ -127,6 +127,7 @@ def create(
     tags: Mapping[str, str] | None = None,
     cog: bool = False,
     compressed: bool = True,
+    threads: int = 1,
 ) -> Iterator[RasterWriter]:
     """A raster to be written by windows; it appears under its name when all went well.
 
@@ -148,6 +149,8 @@ def create(
         Cloud-optimised, with overviews.
     compressed : bool
         Without loss. What is read once and then removed is handled several times quicker as it is.
+    threads : int
+        That compress; the file is the same whatever their number.
 
     Yields
     ------
@@ -172,6 +175,7 @@ def create(
         "blockysize": _TILE,
         "interleave": "band",
         "bigtiff": "if_safer",
+        "num_threads": threads,
     }
     if compressed:
         options |= {"compress": "zstd", "zstd_level": 1, "predictor": 3 if floating else 2}
@@ -182,7 +186,7 @@ def create(
             dataset.update_tags(**dict(tags or {}))
             yield RasterWriter(dataset)
         if cog:
-            _to_cog(temporary, floating)
+            _to_cog(temporary, floating, threads)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -273,7 +277,7 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _to_cog(path: Path, floating: bool) -> None:
+def _to_cog(path: Path, floating: bool, threads: int) -> None:
     target = path.with_name(f"{path.stem}.cog{path.suffix}")
     try:
         copy_dataset(
@@ -285,6 +289,7 @@ def _to_cog(path: Path, floating: bool) -> None:
             predictor="yes",
             bigtiff="if_safer",
             overview_resampling="average",
+            num_threads=threads,
         )
         target.replace(path)
     finally:

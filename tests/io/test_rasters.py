@@ -109,3 +109,16 @@ def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path):
     other.write_text("of another file")
     rasters.write(tmp_path / "h.tif", heights(), grid=MAP, crs="EPSG:32632")
     assert sorted(path.name for path in tmp_path.iterdir()) == [other.name, "h.tif"]
+
+
+@pytest.mark.parametrize("cog", [False, True])
+def test_threads_that_compress_change_no_byte(tmp_path, cog):
+    values = np.random.default_rng(3).normal(0, 1, (1200, 1300)).astype(np.float32).round(2)
+    grid = PixelGrid(600000, 5200000, 10, -10, values.shape)
+    for threads in (1, 2):
+        path = tmp_path / f"{threads}.tif"
+        with rasters.create(
+            path, shape=values.shape, dtype=np.float32, grid=grid, crs="EPSG:32632", cog=cog, threads=threads
+        ) as file:
+            file.write(None, values)
+    assert (tmp_path / "1.tif").read_bytes() == (tmp_path / "2.tif").read_bytes()
