@@ -48,10 +48,7 @@ def rectify(
     log = logging.getLogger("rectify")
     fore = records.read(fore_camera_path, PanoramicCamera)
     aft = records.read(aft_camera_path, PanoramicCamera).moved_to(fore.origin)
-    films = tuple(
-        FilmMapping(camera.locate, camera.project, camera.half_length_mm, camera.half_width_mm)
-        for camera in (fore, aft)
-    )
+    films = (FilmMapping.of(fore), FilmMapping.of(aft))
     film_paths = (fore_film_path, aft_film_path)
     film_grids = [rasters.info(path).grid for path in film_paths]
     pixel_mm = min(abs(grid.step_x) for grid in film_grids)

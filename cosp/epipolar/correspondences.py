@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosp.arrays import BoolArray, FloatArray
+from cosp.camera.field import FilmField
+from cosp.camera.panoramic import PanoramicCamera
 from cosp.epipolar.polynomials import Basis
 from cosp.errors import NoOverlapError
 from cosp.geometry.robust import tukey_weights
@@ -27,12 +29,21 @@ class FilmMapping:
         Film points (..., 2) in mm of ground points (..., 3); NaN where the camera does not see the point.
     half_length_mm, half_width_mm : float
         Half the usable film, along x and along y.
+    field : FilmField, optional
+        Distortion that the film has besides: both functions speak of points as they were imaged.
     """
 
     ground_from_film: Callable[[FloatArray, FloatArray], FloatArray]
     film_from_ground: Callable[[FloatArray], FloatArray]
     half_length_mm: float
     half_width_mm: float
+    field: FilmField | None = None
+
+    @classmethod
+    def of(cls, camera: PanoramicCamera) -> FilmMapping:
+        """The film of a panoramic camera, its distortion kept apart: what remains is smooth."""
+        imaging = camera.without_field()
+        return cls(imaging.locate, imaging.project, camera.half_length_mm, camera.half_width_mm, camera.film_field)
 
     def holds(self, film_mm: FloatArray) -> BoolArray:
         """Whether film points (..., 2) lie on the usable film; False for NaN."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from cosp.arrays import Float32Array, FloatArray
+from cosp.camera.field import FilmField
 from cosp.epipolar import kernels
 from cosp.epipolar.correction import RowCorrection
 from cosp.epipolar.correspondences import ConjugatePoints, FilmMapping, virtual_conjugates
@@ -50,6 +51,9 @@ class EpipolarMap:
     row coordinate is a polynomial of both, the column coordinate is u. What was measured to be left across the rows may
     be taken out by a correction.
 
+    A known distortion of the film is no matter of the polynomials: they speak of film points as they were imaged, and
+    film points that are given and asked for are measured ones.
+
     Parameters
     ----------
     direction_deg : float
@@ -70,6 +74,8 @@ class EpipolarMap:
     correction : RowCorrection, optional
         The place (row coordinate, u) of the image shows what the polynomials put that much further along the rows'
         coordinate.
+    film_field : FilmField, optional
+        Distortion of the film.
     """
 
     direction_deg: float
@@ -84,19 +90,20 @@ class EpipolarMap:
     row0_mm: float
     column0_mm: float
     correction: RowCorrection | None = None
+    film_field: FilmField | None = None
 
     @property
     def _axes(self) -> FloatArray:
         """Columns: the unit vectors of u and v on the film."""
         return film_axes(math.radians(self.direction_deg))
 
-    def uv(self, film_mm: FloatArray) -> FloatArray:
-        """Film points (..., 2) in the turned frame, mm."""
-        return np.asarray((np.asarray(film_mm, float) - np.array(self.centre_mm)) @ self._axes)
+    def uv(self, imaged_mm: FloatArray) -> FloatArray:
+        """Film points (..., 2) as they were imaged, in the turned frame, mm."""
+        return np.asarray((np.asarray(imaged_mm, float) - np.array(self.centre_mm)) @ self._axes)
 
     def epipolar(self, film_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows and columns (...) of film points (..., 2); NaN outside the part of the film that was rectified."""
-        uv = self.uv(film_mm)
+        uv = self.uv(film_mm if self.film_field is None else self.film_field.corrected(film_mm))
         u, v = uv[..., 0] / self.half_u_mm, uv[..., 1] / self.half_v_mm
         row_mm = evaluate(self.rows, u, v)
         rows = (row_mm - self.row0_mm) / self.pixel_mm
@@ -112,6 +119,11 @@ class EpipolarMap:
 
     def film(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
         """Film points (..., 2) in mm of rows and columns (broadcast together); NaN where `epipolar` gives NaN."""
+        imaged_mm = self.imaged(rows, columns)
+        return imaged_mm if self.film_field is None else self.film_field.distorted(imaged_mm)
+
+    def imaged(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        """The same as `film`, of a film without distortion."""
         shape = np.broadcast_shapes(np.shape(rows), np.shape(columns))
         # Lists of points go through as one line; a copy, where one is made, is of the size of the result.
         flat = shape if len(shape) == 2 else (1, math.prod(shape))
@@ -120,9 +132,9 @@ class EpipolarMap:
         if not one_row_a_line:
             rows = np.broadcast_to(rows, shape).reshape(flat)
         columns = np.broadcast_to(columns, shape).reshape(flat)
-        film_mm = np.empty((*flat, 2))
-        self._to_film(rows, columns, film_mm)
-        return film_mm.reshape(*shape, 2)
+        imaged_mm = np.empty((*flat, 2))
+        self._invert(rows, columns, imaged_mm)
+        return imaged_mm.reshape(*shape, 2)
 
     def film_window(self, window: Window, film_grid: PixelGrid) -> Window:
         """The part of the film raster that a window of the rectified image shows; of no size where there is none."""
@@ -169,8 +181,8 @@ class EpipolarMap:
             rows, columns, pixel_mm=self.pixel_mm, row0_mm=self.row0_mm, column0_mm=self.column0_mm
         )
 
-    def _to_film(self, rows: FloatArray, columns: FloatArray, film_mm: FloatArray) -> None:
-        """Fill (H, W, 2) with the film points of rows, (H, W) or (H, 1), and columns (H, W)."""
+    def _invert(self, rows: FloatArray, columns: FloatArray, imaged_mm: FloatArray) -> None:
+        """Fill (H, W, 2) with the imaged points of rows, (H, W) or (H, 1), and columns (H, W)."""
         scaled = self._axes * np.array([self.half_u_mm, self.half_v_mm])
         kernels.film_points(
             _powers_of_chebyshev(len(self.inverse)) @ (self.inverse / self.half_v_mm),
@@ -180,7 +192,7 @@ class EpipolarMap:
             (self.column0_mm / self.half_u_mm, self.pixel_mm / self.half_u_mm),
             1 + _BEYOND,
             np.column_stack([scaled, np.array(self.centre_mm)]),
-            film_mm,
+            imaged_mm,
         )
 
 
@@ -280,7 +292,7 @@ class Rectification:
 
         The interval of one place is much narrower than `disparity_range_px`, which is for the whole image.
         """
-        uv = self.fore.uv(self.fore.film(rows, columns))
+        uv = self.fore.uv(self.fore.imaged(rows, columns))
         u, v = uv[..., 0] / self.fore.half_u_mm, uv[..., 1] / self.fore.half_v_mm
         low = evaluate(self.disparity_low, u, v) + self.disparity_shift_px
         high = evaluate(self.disparity_high, u, v) + self.disparity_shift_px
@@ -356,10 +368,11 @@ def fit_rectification(
     Parameters
     ----------
     conjugates : ConjugatePoints
-        Spread over the overlap and over the heights of the terrain.
+        Spread over the overlap and over the heights of the terrain; film points as the mappings have them.
     films : fore and aft FilmMapping
-        Where conjugates are virtual, they tell a little of what lies beyond the films' edges, too: the corners of a
-        rectified image hold no film, and its polynomials must not run away there and come back.
+        Their fields become those of the rectification. Where conjugates are virtual, they tell a little of what lies
+        beyond the films' edges, too: the corners of a rectified image hold no film, and its polynomials must not run
+        away there and come back.
     pixel_mm : float
         Pixel of the epipolar grid; the film's own keeps its resolution.
     basis : Basis
@@ -425,6 +438,7 @@ def fit_rectification(
                 pixel_mm=pixel_mm,
                 row0_mm=row_low,
                 column0_mm=column_low + ahead,
+                film_field=films[k].field,
             )
         )
 

@@ -73,6 +73,7 @@ def ascending(camera):
 
 
 def mapping(camera):
+    """A camera as two functions, whatever lies in them; `FilmMapping.of` keeps a film field apart."""
     return FilmMapping(camera.locate, camera.project, camera.half_length_mm, camera.half_width_mm)
 
 
@@ -81,9 +82,18 @@ FILM_PIXEL_MM = 0.14
 
 
 @functools.cache
-def rectified(fore, aft, *, heights=(0.0, 1000.0, 2000.0, 3000.0), pixel_mm=0.007, basis=SEPARABLE, margin_px=0.0):
+def rectified(
+    fore,
+    aft,
+    *,
+    heights=(0.0, 1000.0, 2000.0, 3000.0),
+    pixel_mm=0.007,
+    basis=SEPARABLE,
+    margin_px=0.0,
+    film_of=mapping,
+):
     """Conjugate points of a pair of cameras and their rectification."""
-    films = (mapping(fore), mapping(aft))
+    films = (film_of(fore), film_of(aft))
     conjugates = virtual_conjugates(*films, np.array(heights), even=basis.total)
     return conjugates, fit_rectification(
         conjugates, films, pixel_mm=pixel_mm, basis=basis, disparity_margin_px=margin_px
