@@ -90,7 +90,7 @@ def assess_dem(
         return models["after"][inner], (models["after"] - others["reference"])[inner], cells
 
     factor = max(1, math.ceil(math.sqrt(math.prod(grid.shape) / CELLS_OF_MAPS)))
-    height = STRIP_ROWS * factor
+    height = factor * max(1, STRIP_ROWS // factor)  # whole steps of the maps
     gathered, after_thinned, difference_thinned = [], [], []
     with rasters.create(
         difference_path,
