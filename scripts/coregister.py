@@ -113,7 +113,7 @@ def thinned(path, factor):
     rows, columns = rasters.info(path).shape
     height = factor * 512
     strips = [Window(row, min(row + height, rows), 0, columns) for row in range(0, rows, height)]
-    return np.concatenate([rasters.read(path, window=strip)[::factor, ::factor] for strip in strips])
+    return np.concatenate([rasters.read(path, window=strip)[::factor, ::factor].copy() for strip in strips])
 
 
 def scaled_window(window, factor, shape):
