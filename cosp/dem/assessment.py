@@ -13,6 +13,7 @@ from cosp.dem.differencing import difference_statistics, statistics_by_slope
 from cosp.geometry.grids import PixelGrid
 
 _STRIP_ROWS = 512
+_BLOCK_CELLS = 16
 
 
 def seen_by(
@@ -33,17 +34,59 @@ def seen_by(
     film_bounds_mm : (xmin, ymin, xmax, ymax)
         Of the film as it is, clipped ends left out.
     """
-    xmin, ymin, xmax, ymax = film_bounds_mm
     seen = np.zeros(grid.shape, bool)
     for row0 in range(0, grid.shape[0], _STRIP_ROWS):
         row1 = min(row0 + _STRIP_ROWS, grid.shape[0])
-        xy = grid.window(row0, row1, 0, grid.shape[1]).centres()
-        film = film_mm(xy[..., 0], xy[..., 1], heights_m[row0:row1])
-        with np.errstate(invalid="ignore"):
-            seen[row0:row1] = (
-                (film[..., 0] >= xmin) & (film[..., 0] <= xmax) & (film[..., 1] >= ymin) & (film[..., 1] <= ymax)
-            )
+        part = grid.window(row0, row1, 0, grid.shape[1])
+        seen[row0:row1] = _seen_in_strip(film_mm, heights_m[row0:row1], part, film_bounds_mm)
     return seen
+
+
+def _seen_in_strip(
+    film_mm: Callable[[FloatArray, FloatArray, FloatArray], FloatArray],
+    heights_m: FloatArray,
+    grid: PixelGrid,
+    film_bounds_mm: tuple[float, float, float, float],
+) -> BoolArray:
+    """`seen_by` in a strip: cells are looked up where the corners of their block, at its extreme heights, disagree."""
+    xmin, ymin, xmax, ymax = film_bounds_mm
+    measured = np.isfinite(heights_m)
+    (rows, last_rows), (columns, last_columns) = (
+        (first, np.minimum(first + _BLOCK_CELLS, length) - 1)
+        for length in grid.shape
+        for first in [np.arange(0, length, _BLOCK_CELLS)]
+    )
+    extremes_m = [
+        extreme.reduceat(extreme.reduceat(heights_m, rows, axis=0), columns, axis=1) for extreme in (np.fmin, np.fmax)
+    ]
+    corners = np.stack(
+        [
+            film_mm(*np.moveaxis(grid.points(row[:, None], column), -1, 0), height_m)
+            for row in (rows, last_rows)
+            for column in (columns, last_columns)
+            for height_m in extremes_m
+        ]
+    )
+    x, y = corners[..., 0], corners[..., 1]
+    with np.errstate(invalid="ignore"):
+        inside = _within(corners, film_bounds_mm).all(axis=0)
+        beyond = (x < xmin).all(axis=0) | (x > xmax).all(axis=0) | (y < ymin).all(axis=0) | (y > ymax).all(axis=0)
+
+    def cells(blocks: BoolArray) -> BoolArray:
+        return np.repeat(np.repeat(blocks, last_rows - rows + 1, axis=0), last_columns - columns + 1, axis=1)
+
+    seen = cells(inside) & measured
+    doubtful = np.nonzero(cells(~(inside | beyond)) & measured)
+    film = film_mm(*np.moveaxis(grid.points(*doubtful), -1, 0), heights_m[doubtful])
+    seen[doubtful] = _within(film, film_bounds_mm)
+    return seen
+
+
+def _within(film_mm: FloatArray, bounds_mm: tuple[float, float, float, float]) -> BoolArray:
+    xmin, ymin, xmax, ymax = bounds_mm
+    x, y = film_mm[..., 0], film_mm[..., 1]
+    with np.errstate(invalid="ignore"):
+        return (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)
 
 
 def textured(grey: FloatArray, *, least_grey: float, window_cells: int) -> BoolArray:

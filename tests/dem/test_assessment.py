@@ -54,6 +54,31 @@ def test_cells_are_seen_where_they_fall_on_the_film():
     assert np.array_equal(seen, expected)
 
 
+@pytest.mark.parametrize("turn_deg", [0, 7, 93])
+def test_cells_are_seen_as_if_each_were_looked_up(turn_deg):
+    """A film askew over steep ground that shifts it, with gaps and with cells whose ray misses it."""
+    grid = PixelGrid.covering((0, 0, 6000, 3330), 10)
+    xy, rng = grid.centres(), np.random.default_rng(turn_deg)
+    heights = 900 * np.sin(xy[..., 0] / 300) * np.cos(xy[..., 1] / 200) + 1000
+    heights[rng.random(grid.shape) < 0.2] = np.nan
+    heights[40:90, 100:180] = np.nan
+    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    asked = []
+
+    def film_mm(east, north, height):
+        asked.append(np.broadcast(east, height).size)
+        x, y = (east - 3000) * cos + (north - 1600) * sin, (north - 1600) * cos - (east - 3000) * sin
+        return np.where((east > 5500)[..., None], np.nan, np.stack([x + 0.3 * height, y - 0.5 * height], axis=-1) / 100)
+
+    bounds = (-20.0, -11.0, 21.0, 4.0)
+    film = film_mm(xy[..., 0], xy[..., 1], heights)
+    each = (film >= bounds[:2]).all(axis=-1) & (film <= bounds[2:]).all(axis=-1)
+    asked.clear()
+    assert np.array_equal(seen_by(film_mm, heights, grid, bounds), each)
+    assert 0.1 < each.mean() < 0.6
+    assert sum(asked) < 0.7 * each.size
+
+
 def test_snow_has_no_texture_and_rock_has():
     rng = np.random.default_rng(7)
     grey = np.full((60, 90), 250.0)
