@@ -61,24 +61,23 @@ def _seen_in_strip(
     ]
     corners = np.stack(
         [
-            film_mm(*np.moveaxis(grid.points(row[:, None], column), -1, 0), height_m)
-            for row in (rows, last_rows)
-            for column in (columns, last_columns)
+            film_mm(xy[..., 0], xy[..., 1], height_m)
+            for xy in (grid.points(r[:, None], c) for r in (rows, last_rows) for c in (columns, last_columns))
             for height_m in extremes_m
         ]
     )
     x, y = corners[..., 0], corners[..., 1]
     with np.errstate(invalid="ignore"):
-        inside = _within(corners, film_bounds_mm).all(axis=0)
-        beyond = (x < xmin).all(axis=0) | (x > xmax).all(axis=0) | (y < ymin).all(axis=0) | (y > ymax).all(axis=0)
+        inside: BoolArray = np.all(_within(corners, film_bounds_mm), axis=0)
+        beyond: BoolArray = np.any([side.all(axis=0) for side in (x < xmin, x > xmax, y < ymin, y > ymax)], axis=0)
 
     def cells(blocks: BoolArray) -> BoolArray:
         return np.repeat(np.repeat(blocks, last_rows - rows + 1, axis=0), last_columns - columns + 1, axis=1)
 
     seen = cells(inside) & measured
     doubtful = np.nonzero(cells(~(inside | beyond)) & measured)
-    film = film_mm(*np.moveaxis(grid.points(*doubtful), -1, 0), heights_m[doubtful])
-    seen[doubtful] = _within(film, film_bounds_mm)
+    xy = grid.points(*doubtful)
+    seen[doubtful] = _within(film_mm(xy[:, 0], xy[:, 1], heights_m[doubtful]), film_bounds_mm)
     return seen
 
 
