@@ -51,11 +51,8 @@ def _seen_in_strip(
     """`seen_by` in a strip: cells are looked up where the corners of their block, at its extreme heights, disagree."""
     xmin, ymin, xmax, ymax = film_bounds_mm
     measured = np.isfinite(heights_m)
-    (rows, last_rows), (columns, last_columns) = (
-        (first, np.minimum(first + _BLOCK_CELLS, length) - 1)
-        for length in grid.shape
-        for first in [np.arange(0, length, _BLOCK_CELLS)]
-    )
+    rows, columns = (np.arange(0, length, _BLOCK_CELLS) for length in grid.shape)
+    last_rows, last_columns = np.append(rows[1:], grid.shape[0]) - 1, np.append(columns[1:], grid.shape[1]) - 1
     extremes_m = [
         extreme.reduceat(extreme.reduceat(heights_m, rows, axis=0), columns, axis=1) for extreme in (np.fmin, np.fmax)
     ]
