@@ -9,7 +9,14 @@ from numba import njit
 
 from cosp.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 
-_CHUNK = 64  # pixels whose rays are intersected side by side
+_CHUNK = 128  # pixels whose rays are intersected side by side
+_LANES = 16  # of which so many at a time, once for each set of nodes that they lie between
+_LINE = _CHUNK + _LANES  # what is written beyond a run of pixels, the next run writes again
+# Lines of a chunk, one array so that the compiler sees that they do not overlap: origin and direction of the fore rays;
+# part of the way between nodes, down and across, and number of the upper left node, -1 where there is none or the pixel
+# is done; NaN where there is no point, else 0; ground point and gap.
+_FORE, _DOWN, _ACROSS, _NODE, _NOWHERE, _GROUND, _GAP = (k * _LINE for k in (0, 6, 7, 8, 9, 10, 13))
+_CHUNK_SIZE = 14 * _LINE
 
 
 @njit(nogil=True, cache=True)
@@ -33,21 +40,29 @@ def intersect_pixels(
     """
     height, width = disparity.shape
     line = np.empty((6, fore_table.shape[1]))
-    chunk = np.zeros(17 * _CHUNK)
-    places = np.empty((3, _CHUNK))
+    chunk = np.zeros(_CHUNK_SIZE)
     for y in range(height):
         _line_of_nodes(fore_table, fore_scale[0] + fore_scale[1] * every * y, line)
         for start in range(0, width, _CHUNK):
             count = min(_CHUNK, width - start)
             step = fore_scale[3] * every
             _between_nodes_of_line(line, fore_scale[2] + step * start, step, count, chunk)
-            _aft_rays(aft_table, aft_scale, every, y, start, count, disparity[y], y_parallax[y], places, chunk)
-            _meet(chunk)
+            _places_among_nodes(
+                aft_table,
+                aft_scale,
+                every,
+                y,
+                start,
+                disparity[y, start : start + count],
+                y_parallax[y, start : start + count],
+                chunk,
+            )
+            _meet(aft_table, chunk)
             for t in range(count):
-                outside = chunk[16 * _CHUNK + t]
+                nowhere = chunk[_NOWHERE + t]
                 for k in range(3):
-                    ground[y, start + t, k] = chunk[(12 + k) * _CHUNK + t] + outside
-                miss[y, start + t] = chunk[15 * _CHUNK + t] + outside
+                    ground[y, start + t, k] = chunk[_GROUND + k * _LINE + t] + nowhere
+                miss[y, start + t] = chunk[_GAP + t] + nowhere
 
 
 @njit(nogil=True, cache=True)
@@ -75,115 +90,181 @@ def points_of_pixels(
     """
     height, width = disparity.shape
     line = np.empty((6, fore_table.shape[1]))
-    chunk = np.zeros(17 * _CHUNK)
-    places = np.empty((3, _CHUNK))
+    chunk = np.zeros(_CHUNK_SIZE)
     found = 0
     for y in range(height):
         _line_of_nodes(fore_table, fore_scale[0] + fore_scale[1] * y, line)
         for start in range(0, width, _CHUNK):
             count = min(_CHUNK, width - start)
             _between_nodes_of_line(line, fore_scale[2] + fore_scale[3] * start, fore_scale[3], count, chunk)
-            _aft_rays(aft_table, aft_scale, 1, y, start, count, disparity[y], y_parallax[y], places, chunk)
-            _meet(chunk)
-            _onto_map(lattice, lattice_nodes, places, chunk)
+            _places_among_nodes(
+                aft_table,
+                aft_scale,
+                1,
+                y,
+                start,
+                disparity[y, start : start + count],
+                y_parallax[y, start : start + count],
+                chunk,
+            )
+            _meet(aft_table, chunk)
+            _onto_map(lattice, lattice_nodes, chunk)
             for t in range(count):
                 weight = weights[confidence[y, start + t]]
-                gap = chunk[15 * _CHUNK + t] + chunk[16 * _CHUNK + t]
+                gap = chunk[_GAP + t] + chunk[_NOWHERE + t]
                 # A gap of NaN compares false.
                 if gap <= largest_miss and weight > 0.0:
-                    points[found, 0] = (chunk[12 * _CHUNK + t] - cells[0]) * cells[2]
-                    points[found, 1] = (chunk[13 * _CHUNK + t] - cells[1]) * cells[3]
-                    points[found, 2] = chunk[14 * _CHUNK + t]
+                    points[found, 0] = (chunk[_GROUND + t] - cells[0]) * cells[2]
+                    points[found, 1] = (chunk[_GROUND + _LINE + t] - cells[1]) * cells[3]
+                    points[found, 2] = chunk[_GROUND + 2 * _LINE + t]
                     points[found, 3] = weight
                     found += 1
     return found
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
-def _aft_rays(
+def _places_among_nodes(
     table: FloatArray,
     scale: tuple[float, float, float, float],
     every: int,
     y: int,
     start: int,
-    count: int,
     disparity: FloatArray,
     y_parallax: FloatArray,
-    places: FloatArray,
     chunk: FloatArray,
 ) -> None:
-    """Aft rays of the pixels of a chunk into its lines 6 to 11, and NaN into line 16 where there are none, else 0."""
-    node_columns = table.shape[1]
-    nodes = table.reshape(-1, 8)
-    last_row, last_column = float(table.shape[0] - 1), float(node_columns - 1)
-    along, across, corner = places[0], places[1], places[2]
-    for t in range(count):
-        row = scale[0] + scale[1] * (every * y + y_parallax[start + t])
-        column = scale[2] + scale[3] * (every * (start + t) + disparity[start + t])
-        inside = row >= 0.0 and row < last_row and column >= 0.0 and column < last_column
+    """Where among the nodes of the aft table the conjugates of the pixels of a chunk lie."""
+    node_columns = float(table.shape[1])
+    last_row, last_column = float(table.shape[0] - 1), node_columns - 1.0
+    first_row, first_column = scale[0] + scale[1] * every * y, scale[2] + scale[3] * every * start
+    for t in range(min(disparity.size, _CHUNK)):
+        chunk[_DOWN + t] = y_parallax[t]
+        chunk[_ACROSS + t] = disparity[t]
+    for t in range(_CHUNK):
+        row = first_row + scale[1] * chunk[_DOWN + t]
+        column = first_column + scale[3] * (every * t + chunk[_ACROSS + t])
+        inside = (row >= 0.0) & (row < last_row) & (column >= 0.0) & (column < last_column)
         row = row if inside else 0.0
         column = column if inside else 0.0
         i, j = np.floor(row), np.floor(column)
-        along[t], across[t] = row - i, column - j
-        corner[t] = i * node_columns + j
-        chunk[16 * _CHUNK + t] = 0.0 if inside else np.nan
-    t = 0
-    while t < count:
-        stop = _end_of_run(corner, chunk, t, count)
-        upper = int(corner[t])
-        lower = upper + node_columns
-        for k in range(6):
-            base = nodes[upper, k]
-            by_row, by_column = nodes[lower, k] - base, nodes[upper + 1, k] - base
-            by_both = nodes[lower + 1, k] - nodes[lower, k] - by_column
-            for u in range(t, stop):
-                chunk[(6 + k) * _CHUNK + u] = base + along[u] * by_row + across[u] * (by_column + along[u] * by_both)
-        t = stop
+        chunk[_DOWN + t] = row - i
+        chunk[_ACROSS + t] = column - j
+        chunk[_NODE + t] = i * node_columns + j if inside else -1.0
+        chunk[_NOWHERE + t] = 0.0 if inside else np.nan
 
 
-@njit(nogil=True, cache=True)
-def _end_of_run(corner: FloatArray, chunk: FloatArray, start: int, count: int) -> int:
-    """Where the run of pixels of a chunk ends that lie between the same nodes as the first; what is nowhere joins."""
-    stop = start + 1
-    while stop < count and (corner[stop] == corner[start] or chunk[16 * _CHUNK + stop] != 0.0):
-        stop += 1
-    return stop
+@njit(nogil=True, cache=True, fastmath={"nnan", "nsz"})
+def _largest_node(part: FloatArray) -> float:
+    """Largest number of a node in a block; -1 where no pixel of it is left."""
+    # Four at a time, which need not wait for each other.
+    a = b = c = d = -1.0
+    for n in range(_NODE, _NODE + _LANES, 4):
+        a = part[n] if part[n] > a else a
+        b = part[n + 1] if part[n + 1] > b else b
+        c = part[n + 2] if part[n + 2] > c else c
+        d = part[n + 3] if part[n + 3] > d else d
+    return max(max(a, b), max(c, d))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _corners(nodes: FloatArray, upper: int, columns: int, k: int) -> tuple[float, float, float, float]:
+    """What makes the k-th value between four nodes: constant, change downwards, across, and both."""
+    base = nodes[upper, k]
+    by_row, by_column = nodes[upper + columns, k] - base, nodes[upper + 1, k] - base
+    return base, by_row, by_column, nodes[upper + columns + 1, k] - nodes[upper + columns, k] - by_column
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
-def _onto_map(lattice: FloatArray, nodes: tuple[float, float, float], places: FloatArray, chunk: FloatArray) -> None:
-    """Replace the ground points of a chunk by map coordinates and heights; NaN into line 16 outside the lattice."""
+def _meet(table: FloatArray, chunk: FloatArray) -> None:
+    """Ground points and gaps of the pixels of a chunk: where its fore rays pass the aft rays nearest."""
+    columns = table.shape[1]
+    nodes = table.reshape(-1, 8)
+    for block in range(0, _CHUNK, _LANES):
+        part = chunk[block:]
+        node = _largest_node(part)
+        while node >= 0.0:
+            upper = int(node)
+            x0, x1, x2, x3 = _corners(nodes, upper, columns, 0)
+            y0, y1, y2, y3 = _corners(nodes, upper, columns, 1)
+            z0, z1, z2, z3 = _corners(nodes, upper, columns, 2)
+            u0, u1, u2, u3 = _corners(nodes, upper, columns, 3)
+            v0, v1, v2, v3 = _corners(nodes, upper, columns, 4)
+            w0, w1, w2, w3 = _corners(nodes, upper, columns, 5)
+            for n in range(_LANES):
+                p, q = part[_DOWN + n], part[_ACROSS + n]
+                b0 = u0 + p * u1 + q * (u2 + p * u3)
+                b1 = v0 + p * v1 + q * (v2 + p * v3)
+                b2 = w0 + p * w1 + q * (w2 + p * w3)
+                o0, o1, o2 = part[_FORE + n], part[_FORE + _LINE + n], part[_FORE + 2 * _LINE + n]
+                a0, a1, a2 = part[_FORE + 3 * _LINE + n], part[_FORE + 4 * _LINE + n], part[_FORE + 5 * _LINE + n]
+                d0 = o0 - (x0 + p * x1 + q * (x2 + p * x3))
+                d1 = o1 - (y0 + p * y1 + q * (y2 + p * y3))
+                d2 = o2 - (z0 + p * z1 + q * (z2 + p * z3))
+                aa = a0 * a0 + a1 * a1 + a2 * a2
+                ab = a0 * b0 + a1 * b1 + a2 * b2
+                bb = b0 * b0 + b1 * b1 + b2 * b2
+                ad = a0 * d0 + a1 * d1 + a2 * d2
+                bd = b0 * d0 + b1 * d1 + b2 * d2
+                scale = 1.0 / (aa * bb - ab * ab)
+                along_a = (ab * bd - bb * ad) * scale
+                along_b = (aa * bd - ab * ad) * scale
+                # Gap vector between the nearest points of both rays; half of it leads to the midpoint.
+                g0 = d0 + along_a * a0 - along_b * b0
+                g1 = d1 + along_a * a1 - along_b * b1
+                g2 = d2 + along_a * a2 - along_b * b2
+                e0 = o0 + along_a * a0 - 0.5 * g0
+                e1 = o1 + along_a * a1 - 0.5 * g1
+                e2 = o2 + along_a * a2 - 0.5 * g2
+                gap = math.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
+                mine = part[_NODE + n] == node
+                part[_GROUND + n] = e0 if mine else part[_GROUND + n]
+                part[_GROUND + _LINE + n] = e1 if mine else part[_GROUND + _LINE + n]
+                part[_GROUND + 2 * _LINE + n] = e2 if mine else part[_GROUND + 2 * _LINE + n]
+                part[_GAP + n] = gap if mine else part[_GAP + n]
+                part[_NODE + n] = -1.0 if mine else part[_NODE + n]
+            node = _largest_node(part)
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
+def _onto_map(lattice: FloatArray, lattice_nodes: tuple[float, float, float], chunk: FloatArray) -> None:
+    """Replace the ground points of a chunk by map coordinates and heights; off the lattice is nowhere."""
     columns = lattice.shape[1]
-    values = lattice.reshape(-1, 6)
+    nodes = lattice.reshape(-1, 6)
     last_u, last_v = float(columns - 1), float(lattice.shape[0] - 1)
-    per_step = 1.0 / nodes[2]
-    down, along, corner = places[0], places[1], places[2]
+    per_step = 1.0 / lattice_nodes[2]
     for t in range(_CHUNK):
-        u = (chunk[12 * _CHUNK + t] - nodes[0]) * per_step
-        v = (chunk[13 * _CHUNK + t] - nodes[1]) * per_step
-        inside = u >= 0.0 and v >= 0.0 and u < last_u and v < last_v
+        u = (chunk[_GROUND + t] - lattice_nodes[0]) * per_step
+        v = (chunk[_GROUND + _LINE + t] - lattice_nodes[1]) * per_step
+        inside = (u >= 0.0) & (v >= 0.0) & (u < last_u) & (v < last_v)
         u = u if inside else 0.0
         v = v if inside else 0.0
         i, j = np.floor(v), np.floor(u)
-        down[t], along[t] = v - i, u - j
-        corner[t] = i * columns + j
-        chunk[16 * _CHUNK + t] += 0.0 if inside else np.nan
-    t = 0
-    while t < _CHUNK:
-        stop = _end_of_run(corner, chunk, t, _CHUNK)
-        upper = int(corner[t])
-        lower = upper + columns
-        for k in range(3):
-            a0, b0 = values[upper, k], values[upper, k + 3]
-            a1, b1 = values[lower, k] - a0, values[lower, k + 3] - b0
-            a2, b2 = values[upper + 1, k] - a0, values[upper + 1, k + 3] - b0
-            a3, b3 = values[lower + 1, k] - a0 - a1 - a2, values[lower + 1, k + 3] - b0 - b1 - b2
-            # Heights are the last of the three to be replaced: until then they are what the slopes go with.
-            for n in range(t, stop):
-                base = a0 + down[n] * a1 + along[n] * (a2 + down[n] * a3)
-                slope = b0 + down[n] * b1 + along[n] * (b2 + down[n] * b3)
-                chunk[(12 + k) * _CHUNK + n] = base + chunk[14 * _CHUNK + n] * slope
-        t = stop
+        chunk[_DOWN + t] = v - i
+        chunk[_ACROSS + t] = u - j
+        chunk[_NODE + t] = i * columns + j if inside else -1.0
+        chunk[_NOWHERE + t] += 0.0 if inside else np.nan
+    for block in range(0, _CHUNK, _LANES):
+        part = chunk[block:]
+        node = _largest_node(part)
+        while node >= 0.0:
+            upper = int(node)
+            x0, x1, x2, x3 = _corners(nodes, upper, columns, 0)
+            y0, y1, y2, y3 = _corners(nodes, upper, columns, 1)
+            z0, z1, z2, z3 = _corners(nodes, upper, columns, 2)
+            u0, u1, u2, u3 = _corners(nodes, upper, columns, 3)
+            v0, v1, v2, v3 = _corners(nodes, upper, columns, 4)
+            w0, w1, w2, w3 = _corners(nodes, upper, columns, 5)
+            for n in range(_LANES):
+                p, q, h = part[_DOWN + n], part[_ACROSS + n], part[_GROUND + 2 * _LINE + n]
+                x = x0 + p * x1 + q * (x2 + p * x3) + h * (u0 + p * u1 + q * (u2 + p * u3))
+                y = y0 + p * y1 + q * (y2 + p * y3) + h * (v0 + p * v1 + q * (v2 + p * v3))
+                z = z0 + p * z1 + q * (z2 + p * z3) + h * (w0 + p * w1 + q * (w2 + p * w3))
+                mine = part[_NODE + n] == node
+                part[_GROUND + n] = x if mine else part[_GROUND + n]
+                part[_GROUND + _LINE + n] = y if mine else part[_GROUND + _LINE + n]
+                part[_GROUND + 2 * _LINE + n] = z if mine else h
+                part[_NODE + n] = -1.0 if mine else part[_NODE + n]
+            node = _largest_node(part)
 
 
 @njit(nogil=True, cache=True)
@@ -196,49 +277,39 @@ def _line_of_nodes(table: FloatArray, row: float, line: FloatArray) -> None:
             line[k, j] = table[i, j, k] + part * (table[i + 1, j, k] - table[i, j, k])
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
+def _ramp(values: FloatArray, j: int, first: float, step: float) -> tuple[float, float]:
+    """Value at place 0, and change from place to place, of the line between two nodes."""
+    slope = values[j + 1] - values[j]
+    return values[j] + slope * (first - j), slope * step
+
+
+@njit(nogil=True, cache=True, fastmath={"contract"})
 def _between_nodes_of_line(line: FloatArray, first: float, step: float, count: int, chunk: FloatArray) -> None:
-    """Values between the nodes of a line at places `step` apart, into the first six lines of a chunk."""
+    """Fore rays of a chunk: values between the nodes of a line at places `step` apart."""
     t = 0
     while t < count:
         j = min(int(first + t * step), line.shape[1] - 2)
         stop = count
         if j < line.shape[1] - 2:
             stop = min(max(int(math.ceil((j + 1 - first) / step)), t + 1), count)
-        for k in range(6):
-            slope = line[k, j + 1] - line[k, j]
-            value = line[k, j] + slope * (first - j)
-            slope *= step
-            for u in range(t, stop):
-                chunk[k * _CHUNK + u] = value + slope * u
+        o0, d0 = _ramp(line[0], j, first, step)
+        o1, d1 = _ramp(line[1], j, first, step)
+        o2, d2 = _ramp(line[2], j, first, step)
+        o3, d3 = _ramp(line[3], j, first, step)
+        o4, d4 = _ramp(line[4], j, first, step)
+        o5, d5 = _ramp(line[5], j, first, step)
+        for block in range(t, stop, _LANES):
+            part = chunk[block:]
+            for n in range(_LANES):
+                u = float(block + n)
+                part[_FORE + n] = o0 + d0 * u
+                part[_FORE + _LINE + n] = o1 + d1 * u
+                part[_FORE + 2 * _LINE + n] = o2 + d2 * u
+                part[_FORE + 3 * _LINE + n] = o3 + d3 * u
+                part[_FORE + 4 * _LINE + n] = o4 + d4 * u
+                part[_FORE + 5 * _LINE + n] = o5 + d5 * u
         t = stop
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
-def _meet(chunk: FloatArray) -> None:
-    """Ground points and gaps, the last four lines of a chunk, of the pairs of rays in the first twelve."""
-    for t in range(_CHUNK):
-        a0, a1, a2 = chunk[3 * _CHUNK + t], chunk[4 * _CHUNK + t], chunk[5 * _CHUNK + t]
-        b0, b1, b2 = chunk[9 * _CHUNK + t], chunk[10 * _CHUNK + t], chunk[11 * _CHUNK + t]
-        w0 = chunk[t] - chunk[6 * _CHUNK + t]
-        w1 = chunk[_CHUNK + t] - chunk[7 * _CHUNK + t]
-        w2 = chunk[2 * _CHUNK + t] - chunk[8 * _CHUNK + t]
-        aa = a0 * a0 + a1 * a1 + a2 * a2
-        ab = a0 * b0 + a1 * b1 + a2 * b2
-        bb = b0 * b0 + b1 * b1 + b2 * b2
-        aw = a0 * w0 + a1 * w1 + a2 * w2
-        bw = b0 * w0 + b1 * w1 + b2 * w2
-        scale = 1.0 / (aa * bb - ab * ab)
-        p = (ab * bw - bb * aw) * scale
-        q = (aa * bw - ab * aw) * scale
-        # Gap vector between the nearest points of both rays; half of it leads to the midpoint.
-        g0 = w0 + p * a0 - q * b0
-        g1 = w1 + p * a1 - q * b1
-        g2 = w2 + p * a2 - q * b2
-        chunk[12 * _CHUNK + t] = chunk[t] + p * a0 - 0.5 * g0
-        chunk[13 * _CHUNK + t] = chunk[_CHUNK + t] + p * a1 - 0.5 * g1
-        chunk[14 * _CHUNK + t] = chunk[2 * _CHUNK + t] + p * a2 - 0.5 * g2
-        chunk[15 * _CHUNK + t] = math.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
 
 
 @njit(nogil=True, cache=True)
