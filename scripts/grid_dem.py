@@ -12,7 +12,7 @@ from cosp.epipolar.rectification import Rectification
 from cosp.geometry.frames import LocalFrame
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.mapping import utm_crs
-from cosp.imaging.windows import Window, tiles
+from cosp.imaging.windows import Window, tiles, worked_on
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
 from cosp.surface.gridding import HALO_CELLS, CellPoints, boxes_meeting, grid_cells, map_boxes
@@ -101,12 +101,10 @@ def grid_dem(
         )
         return grown, grid.window(grown.row0, grown.row1, grown.column0, grown.column1)
 
-    at_hand = {}  # points of windows that tiles in work need, and of some that the next ones may
-
     def heights(tile):
-        grown, part = with_halo(tile)
+        grown, pieces = needed.pop(tile)
         found = grid_cells(
-            [at_hand[number] for number in boxes_meeting(boxes, part.bounds)],
+            [piece.result() for piece in pieces],
             grown,
             kernel_cells=kernel_cells,
             gate_sigmas=gate_sigmas,
@@ -128,27 +126,41 @@ def grid_dem(
         every.sort(key=lambda tile: (tile.column0, tile.row0))
     tags = {"heights": "ellipsoidal (WGS 84)", "unit": "metre"}
     options = {"shape": grid.shape, "dtype": "float32", "grid": grid, "crs": crs, "tags": tags, "cog": True}
+    options["threads"] = threads
+    at_hand = {}  # points of windows, there or to come, that tiles in work need and the next ones may
+    needed = {}  # by tile: the tile with its halo, and the points that it is made of
     filled = 0
     with (
         rasters.create(dem_path, descriptions=["height_m"], **options) as dem,
         rasters.create(sigma_path, count=3, descriptions=["sigma_m", "points", "camera_sigma_m"], **options) as sigma,
         ThreadPoolExecutor(threads) as pool,
     ):
-        for start in range(0, len(every), threads):
-            batch = every[start : start + threads]
-            needed = {number for tile in batch for number in boxes_meeting(boxes, with_halo(tile)[1].bounds)}
-            idle = [number for number in at_hand if number not in needed]
-            for number in idle[: max(len(idle) + len(needed) - WINDOWS_AT_HAND, 0)]:
-                del at_hand[number]
-            missing = sorted(needed - at_hand.keys())
-            at_hand.update(zip(missing, pool.map(map_points, missing), strict=True))
-            for tile, (height_m, sigma_m, count, camera_sigma_m) in zip(batch, pool.map(heights, batch), strict=True):
-                dem.write(tile, height_m)
-                sigma.write(tile, sigma_m, 1)
-                sigma.write(tile, count.astype(np.float32), 2)
-                sigma.write(tile, camera_sigma_m, 3)
-                filled += int(np.isfinite(height_m).sum())
-            log.info("gridded %d/%d tiles, %d cells filled", min(start + threads, len(every)), len(every), filled)
+
+        def prepared():
+            """Tiles one by one, the points of each on their way."""
+            for tile in every:
+                grown, part = with_halo(tile)
+                meeting = boxes_meeting(boxes, part.bounds)
+                idle = [number for number in at_hand if number not in meeting]
+                for number in idle[: max(len(idle) + len(meeting) - WINDOWS_AT_HAND, 0)]:
+                    del at_hand[number]
+                for number in meeting:
+                    if number not in at_hand:
+                        at_hand[number] = pool.submit(map_points, number)
+                needed[tile] = grown, [at_hand[number] for number in meeting]
+                yield tile
+
+        # Work begins in the order in which it was given, so tiles never wait for points that wait for a thread.
+        for number, (tile, (height_m, sigma_m, count, camera_sigma_m)) in enumerate(
+            worked_on(pool, heights, prepared(), ahead=2 * threads), 1
+        ):
+            dem.write(tile, height_m)
+            sigma.write(tile, sigma_m, 1)
+            sigma.write(tile, count.astype(np.float32), 2)
+            sigma.write(tile, camera_sigma_m, 3)
+            filled += int(np.isfinite(height_m).sum())
+            if number % 50 == 0 or number == len(every):
+                log.info("gridded %d/%d tiles, %d cells filled", number, len(every), filled)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import numpy as np
 from cosp.camera.mapping import MapProjector
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
-from cosp.imaging.windows import Window, tiles
+from cosp.imaging.windows import Window, tiles, worked_on
 from cosp.io import rasters, records
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
@@ -93,15 +93,21 @@ def orthorectify(
     every = tiles(ortho_grid.shape, 512)
     with (
         rasters.create(
-            ortho_path, shape=ortho_grid.shape, dtype="uint8", grid=ortho_grid, crs=crs, nodata=0, cog=True
+            ortho_path,
+            shape=ortho_grid.shape,
+            dtype="uint8",
+            grid=ortho_grid,
+            crs=crs,
+            nodata=0,
+            cog=True,
+            threads=threads,
         ) as ortho,
         ThreadPoolExecutor(threads) as pool,
     ):
-        for start in range(0, len(every), threads):
-            batch = every[start : start + threads]
-            for tile, grey in zip(batch, pool.map(expose, batch), strict=True):
-                ortho.write(tile, grey)
-            log.info("exposed %d/%d tiles", min(start + threads, len(every)), len(every))
+        for number, (tile, grey) in enumerate(worked_on(pool, expose, every, ahead=2 * threads), 1):
+            ortho.write(tile, grey)
+            if number % 50 == 0 or number == len(every):
+                log.info("exposed %d/%d tiles", number, len(every))
 
 
 def height_range(dem_path, shape):

@@ -6,7 +6,7 @@ from functools import partial
 
 from cosp.epipolar.rectification import Rectification
 from cosp.epipolar.resampling import resample_window
-from cosp.imaging.windows import tiles
+from cosp.imaging.windows import tiles, worked_on
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
 
@@ -34,7 +34,6 @@ def resample(film_path, film_grid, epipolar_map, grid, path, interpolation, thre
     """Write one rectified image, tile by tile."""
     log = logging.getLogger("resample_epipolar")
     windows = tiles(grid.shape, TILE)
-    batch = 4 * threads
     one = partial(
         resample_window,
         lambda window: rasters.read(film_path, window=window),
@@ -44,15 +43,21 @@ def resample(film_path, film_grid, epipolar_map, grid, path, interpolation, thre
     )
     with (
         rasters.create(
-            path, shape=grid.shape, dtype="uint8", grid=grid, crs=rasters.PIXEL_CRS, nodata=0, descriptions=("grey",)
+            path,
+            shape=grid.shape,
+            dtype="uint8",
+            grid=grid,
+            crs=rasters.PIXEL_CRS,
+            nodata=0,
+            descriptions=("grey",),
+            threads=threads,
         ) as writer,
         ThreadPoolExecutor(threads) as pool,
     ):
-        for start in range(0, len(windows), batch):
-            group = windows[start : start + batch]
-            for window, grey in zip(group, pool.map(one, group), strict=True):
-                writer.write(window, grey)
-            log.info("%s: %d/%d tiles", path, min(start + batch, len(windows)), len(windows))
+        for number, (window, grey) in enumerate(worked_on(pool, one, windows, ahead=4 * threads), 1):
+            writer.write(window, grey)
+            if number % 50 == 0 or number == len(windows):
+                log.info("%s: %d/%d tiles", path, number, len(windows))
 
 
 if __name__ == "__main__":

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from cosp.arrays import FloatArray
+
+ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,30 @@ def strip_of(length: int, scatteritem: str) -> tuple[int, int]:
     """(start, stop) of the piece that a name such as "3-of-16" stands for."""
     index, count = (int(v) for v in scatteritem.split("-of-"))
     return strips(length, count)[index - 1]
+
+
+def worked_on(
+    pool: Executor, function: Callable[[Window], ResultT], windows: Iterable[Window], *, ahead: int
+) -> Iterator[tuple[Window, ResultT]]:
+    """Windows and what a function makes of them, in their order, while the next ones are worked on.
+
+    Parameters
+    ----------
+    pool : Executor
+    function : function of a window
+    windows : iterable of Window
+        Asked for one by one, each when its work can begin.
+    ahead : int
+        Windows in work or done that wait for their turn at most; bounds the memory.
+    """
+    waiting: deque[tuple[Window, Future[ResultT]]] = deque()
+    for window in windows:
+        waiting.append((window, pool.submit(function, window)))
+        if len(waiting) > ahead:
+            done, result = waiting.popleft()
+            yield done, result.result()
+    for done, result in waiting:
+        yield done, result.result()
 
 
 def cosine_weights(shape: tuple[int, int], border: int) -> FloatArray:

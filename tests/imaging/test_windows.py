@@ -1,9 +1,11 @@
 """Windows cover what they should, once."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
-from cosp.imaging.windows import Window, cosine_weights, strip_of, strips, tiles
+from cosp.imaging.windows import Window, cosine_weights, strip_of, strips, tiles, worked_on
 
 
 @pytest.mark.parametrize("overlap", [0, 3])
@@ -22,6 +24,24 @@ def test_strips_are_in_order_and_share_nothing():
     assert all(a[1] == b[0] for a, b in zip(pieces[:-1], pieces[1:], strict=True))
     assert {b - a for a, b in pieces} <= {14, 15}
     assert strip_of(103, "3-of-7") == pieces[2]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_windows_are_worked_on_in_order_and_not_too_far_ahead(threads):
+    windows = tiles((20, 100), 10)
+    asked, taken = [], []
+
+    def one_by_one():
+        for window in windows:
+            assert len(asked) - len(taken) <= 5
+            asked.append(window)
+            yield window
+
+    with ThreadPoolExecutor(threads) as pool:
+        for window, column in worked_on(pool, lambda window: window.column0, one_by_one(), ahead=5):
+            assert column == window.column0
+            taken.append(window)
+    assert taken == asked == windows
 
 
 def test_a_halo_ends_at_the_edge_of_the_raster():
