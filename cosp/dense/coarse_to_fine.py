@@ -83,7 +83,7 @@ def plan_passes(span_px: float) -> list[Pass]:
     """Levels and ranges that find any disparity of a span, coarsest first.
 
     The coarsest level searches everything, then once more what that left over, now that slopes are flat. Mistakes of
-    the coarse levels last and their work is little, so those search widely, and twice.
+    the coarse levels last and their work is little, so those search widely, and all but the last of them twice.
     """
     levels = _FEWEST_LEVELS
     while span_px / 2**levels + 2 * _SLACK_PX > 2 * LEFT_OVER:
@@ -93,7 +93,8 @@ def plan_passes(span_px: float) -> list[Pass]:
     for level in range(levels - 1, -1, -1):
         if level >= 2:
             passes.append(Pass(level, 2 * LEFT_OVER))
-        passes.append(Pass(level, LEFT_OVER))
+        if level != 2:
+            passes.append(Pass(level, LEFT_OVER))
     return passes
 
 
