@@ -1,9 +1,17 @@
+def with_start_interval(given):
+    """An input that dense matching needs only where the reference DEM bounds its disparities."""
+    return given if choices("match_dense")["start_interval_m"] else []
+
+
 rule match_dense:
     input:
         fore="results/pairs/{pair}/fore_epipolar.tif",
         aft="results/pairs/{pair}/aft_epipolar.tif",
         y_parallax="results/pairs/{pair}/y_parallax.tif",
         rectification="results/pairs/{pair}/rectification.json",
+        cameras=with_start_interval(cameras_of_pair),
+        reference_dem=with_start_interval(of_site("reference_dem")),
+        unstable_terrain=with_start_interval(site_file("unstable_terrain")),
     output:
         disparity=temp("results/pairs/{pair}/disparity/{scatteritem}.tif"),
         validity=temp("results/pairs/{pair}/validity/{scatteritem}.tif"),
@@ -21,6 +29,9 @@ rule match_dense:
         **choices("match_dense"),
         scatteritem=lambda wildcards: wildcards.scatteritem,
         library=house.script_digest("match_dense"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+        fore=member("fore"),
+        aft=member("aft"),
     message:
         "Dense matching of {wildcards.pair}, strip {wildcards.scatteritem}"
     script:

@@ -1,15 +1,23 @@
 """Match one strip of an epipolar pair densely: disparity, validity, confidence and similarity of its rows."""
 
-import numpy as np
+import logging
 
+import numpy as np
+from pyproj import Transformer
+
+from cosp.camera.panoramic import PanoramicCamera
 from cosp.dense.coarse_to_fine import STRIP_HALO_PX, match, strip_alignment_px
-from cosp.dense.resampling import SmoothField, fill_holes
+from cosp.dense.resampling import SmoothField, StartInterval, fill_holes
+from cosp.epipolar.rectification import Rectification
+from cosp.epipolar.start_interval import disparities_about
 from cosp.imaging.windows import Window, strip_of
-from cosp.io import rasters, records
+from cosp.io import heights, rasters, records, vectors
 from cosp.io.logs import log_to
 
 SMOOTH_BAND = 2  # of y_parallax.tif
 VALIDITY_BANDS = ("validity", "confidence", "similarity")
+NODE_SPACING_PX = 64  # of the start interval
+FOOTPRINT_POINTS = 25  # a side
 
 
 def match_dense(
@@ -30,6 +38,12 @@ def match_dense(
     largest_speckle_px,
     speckle_step_px,
     threads,
+    start_interval_m=0,
+    fore_camera_path=None,
+    aft_camera_path=None,
+    reference_dem_path=None,
+    reference_dem_heights=None,
+    unstable_path=None,
 ):
     disparity_range_px = records.read_json(rectification_path)["disparity_range_px"]
     header = rasters.info(fore_path)
@@ -40,11 +54,25 @@ def match_dense(
     seen = Window(max(first - STRIP_HALO_PX, 0) // aligned * aligned, min(last + STRIP_HALO_PX, rows), 0, columns)
     aft_seen = Window(seen.row0, seen.row1, 0, rasters.info(aft_path).shape[1])
 
+    start = None
+    if start_interval_m:
+        start = start_interval(
+            records.read(rectification_path, Rectification),
+            records.read(fore_camera_path, PanoramicCamera),
+            records.read(aft_camera_path, PanoramicCamera),
+            reference_dem_path,
+            reference_dem_heights,
+            unstable_path,
+            seen,
+            start_interval_m,
+        )
+
     found = match(
         rasters.read(fore_path, window=seen),
         rasters.read(aft_path, window=aft_seen),
         tuple(disparity_range_px),
         y_parallax=smooth_y_parallax(y_parallax_path, header.grid).moved(seen.row0, 0),
+        start=start,
         small_step=small_step,
         large_step=large_step,
         least_texture_sd=least_texture_sd,
@@ -80,6 +108,51 @@ def smooth_y_parallax(y_parallax_path, fore_grid):
     )
 
 
+def start_interval(rectification, fore, aft, dem_path, dem_heights, unstable_path, window, margin_m):
+    """Disparities of ground near the reference DEM over a window of the fore image; None where there is no DEM."""
+    rows, columns = (
+        np.linspace(first, last - 1, FOOTPRINT_POINTS)
+        for first, last in ((window.row0, window.row1), (window.column0, window.column1))
+    )
+    film_mm = rectification.fore_film(rows[:, None], columns[None, :])
+    lonlat = np.concatenate([fore.locate_geodetic(film_mm, h)[..., :2].reshape(-1, 2) for h in rectification.heights_m])
+    lonlat = lonlat[np.isfinite(lonlat).all(axis=-1)]
+    info = rasters.info(dem_path)
+    to_map = Transformer.from_crs("EPSG:4326", info.crs, always_xy=True)
+    places = info.grid.pixels(np.stack(to_map.transform(lonlat[:, 0], lonlat[:, 1]), axis=-1))
+    ends = []
+    for place, size in zip(places, info.shape, strict=True):
+        margin = 0.05 * np.ptp(place) + 4.0
+        ends += [max(0, int(place.min() - margin)), min(size, int(place.max() + margin))]
+    if ends[0] >= ends[1] or ends[2] >= ends[3]:
+        return None
+    grid = info.grid.window(*ends)
+    height_m = heights.ellipsoidal_heights(dem_path, grid, info.crs, dem_heights)
+    unsure = vectors.rasterise(unstable_path, grid, info.crs) if unstable_path else np.zeros(grid.shape, bool)
+    centres = grid.centres()
+    lon, lat = to_map.transform(centres[..., 0], centres[..., 1], direction="INVERSE")
+    lowest, highest, spacing_px = disparities_about(
+        rectification,
+        fore.project_geodetic,
+        aft.project_geodetic,
+        np.stack([lon, lat, height_m], axis=-1),
+        unsure,
+        window,
+        margin_m=margin_m,
+        least_spacing_px=NODE_SPACING_PX,
+    )
+    low, high = rectification.disparity_range_px
+    bound = (lowest > low) | (highest < high)
+    logging.getLogger("match_dense").info(
+        "start interval from the reference DEM over %.0f %% of the strip, %.0f px wide in the middle",
+        100 * bound.mean(),
+        np.median((highest - lowest)[bound]) if bound.any() else high - low,
+    )
+    return StartInterval(
+        *(SmoothField(nodes.astype(np.float32), 0.0, 0.0, spacing_px, spacing_px) for nodes in (lowest, highest))
+    )
+
+
 if __name__ == "__main__":
     with log_to(snakemake.log[0]):
         match_dense(
@@ -99,4 +172,10 @@ if __name__ == "__main__":
             largest_speckle_px=snakemake.params.largest_speckle_px,
             speckle_step_px=snakemake.params.speckle_step_px,
             threads=snakemake.threads,
+            start_interval_m=snakemake.params.start_interval_m,
+            fore_camera_path=f"{snakemake.input.get('cameras')}/{snakemake.params.fore}.json",
+            aft_camera_path=f"{snakemake.input.get('cameras')}/{snakemake.params.aft}.json",
+            reference_dem_path=snakemake.input.get("reference_dem"),
+            reference_dem_heights=snakemake.params.reference_dem_heights,
+            unstable_path=snakemake.input.get("unstable_terrain"),
         )

@@ -24,6 +24,7 @@ from cosp.dense.memory import Workspace, workspace
 from cosp.dense.resampling import (
     CONTEXT_PX,
     SmoothField,
+    StartInterval,
     continue_beyond_edges,
     picture_pyramid,
     prior_of,
@@ -75,6 +76,7 @@ class _Task:
     before_level: int
     range_px: tuple[float, float]  # at this level
     y_parallax: SmoothField
+    start: StartInterval | None
     small_step: int
     large_step: int
 
@@ -113,6 +115,7 @@ def match(
     speckle_step_px: float,
     threads: int,
     y_parallax: SmoothField | None = None,
+    start: StartInterval | None = None,
     rows: tuple[int, int] | None = None,
     tile_px: int = TILE_PX,
 ) -> DisparityMap:
@@ -140,6 +143,9 @@ def match(
         Islands of up to so many pixels, cut off by steps of more than so much, are masked.
     y_parallax : SmoothField, px
         Right row minus left row by left pixel; taken out in the resampling that happens anyway.
+    start : StartInterval
+        Between which disparities each match must lie, within the range: others count as at the edge of the range, and
+        in their stead finer levels start from the middle.
     rows : (first, last)
         Rows of which the disparity is wanted, the last excluded. The coarser a level, the more of the rows around are
         matched, too.
@@ -170,6 +176,7 @@ def match(
             right,
             disparity_range_px,
             y_parallax or _NO_FIELD,
+            start,
             seen,
             small_step=small_step,
             large_step=large_step,
@@ -215,6 +222,7 @@ def _coarse_to_fine(
     right: ByteArray,
     range_px: tuple[float, float],
     y_parallax: SmoothField,
+    start: StartInterval | None,
     wanted: Window,
     *,
     small_step: int,
@@ -240,6 +248,7 @@ def _coarse_to_fine(
             level,
             (low / 2**step.level, high / 2**step.level),
             y_parallax,
+            start,
             # Before the first resampling slopes are not flat yet.
             small_step if found is not None else max(small_step // 2, 1),
             large_step,
@@ -358,6 +367,8 @@ def _matched(
             limits=task.range_px,
             memory=memory,
         )
+        if task.start is not None:
+            np.clip(prior, *task.start.over(wide, task.step.level), out=prior)
     right = resample_right(
         task.right,
         prior,
@@ -383,7 +394,7 @@ def _matched(
         large_step=task.large_step,
         memory=memory,
     )
-    return select_disparities(
+    result, matched = select_disparities(
         found,
         prior,
         right,
@@ -393,6 +404,17 @@ def _matched(
         whole=least_texture_sd is not None,
         memory=memory,
     )
+    if task.start is not None:
+        _put_back(result, *task.start.over(window, task.step.level))
+    return result, matched
+
+
+def _put_back(result: DisparityMap, lowest: Float32Array, highest: Float32Array) -> None:
+    """Flag what lies outside an interval and put the middle in its place, in place."""
+    with np.errstate(invalid="ignore"):
+        outside = (result.disparity < lowest) | (result.disparity > highest)
+    result.validity[outside] |= np.uint8(Validity.AT_RANGE_EDGE)
+    result.disparity[outside] = (lowest[outside] + highest[outside]) / 2
 
 
 def _cleaned(

@@ -13,6 +13,7 @@ import numpy as np
 from cosp.arrays import ByteArray, Float32Array
 from cosp.dense import kernels
 from cosp.dense.memory import Workspace
+from cosp.geometry.lattices import between_nodes
 from cosp.imaging.windows import Window
 
 _log = logging.getLogger(__name__)
@@ -45,6 +46,32 @@ class SmoothField:
         return SmoothField(
             self.values, self.first_row - rows, self.first_column - columns, self.row_step, self.column_step
         )
+
+    def over(self, window: Window, level: int) -> Float32Array:
+        """Values at the pixels of a window of a level of the pyramid, the outermost beyond the nodes."""
+        scale = 2**level
+        return between_nodes(
+            self.values,
+            (
+                (scale * window.row0 - self.first_row) / self.row_step,
+                (scale * window.column0 - self.first_column) / self.column_step,
+            ),
+            (scale / self.row_step, scale / self.column_step),
+            window.shape,
+        )
+
+
+@dataclass(frozen=True)
+class StartInterval:
+    """Between which disparities a match must lie, px of level 0, as a known surface tells."""
+
+    lowest: SmoothField
+    highest: SmoothField
+
+    def over(self, window: Window, level: int) -> tuple[Float32Array, Float32Array]:
+        """Lowest and highest disparity at the pixels of a window of a level, in its pixels."""
+        scale = np.float32(2.0**-level)
+        return self.lowest.over(window, level) * scale, self.highest.over(window, level) * scale
 
 
 def resample_right(
