@@ -162,14 +162,15 @@ def grid_cells(
 
 def _by_cell(pieces: Sequence[CellPoints], window: Window) -> tuple[Float32Array, IntArray]:
     """Points (N, 4) in the order of the window's cells, places from the cell's centre, and where each cell starts."""
-    starts = np.zeros(window.shape[0] * window.shape[1] + 1, np.int32)
-    cells = [np.empty(len(piece.values), np.int32) for piece in pieces]
+    counts = np.zeros(window.shape[0] * window.shape[1] + 1, np.uint32)
+    # Unsigned: what cannot be negative need not be looked at as places from the end.
+    cells = [np.empty(len(piece.values), np.uint32) for piece in pieces]
     for piece, of_piece in zip(pieces, cells, strict=True):
         shift = (piece.row0 - window.row0, piece.column0 - window.column0)
-        kernels.count_by_cell(piece.values, *shift, window.shape, of_piece, starts)
-    np.cumsum(starts, out=starts)
+        kernels.count_by_cell(piece.values, *shift, window.shape, of_piece, counts)
+    starts = np.concatenate([[0], np.cumsum(counts[:-1])]).astype(np.int32)
     ordered = np.empty((int(starts[-1]), 4), np.float32)
-    place = starts[:-1].copy()
+    place = starts[:-1].astype(np.uint32)
     for piece, of_piece in zip(pieces, cells, strict=True):
         kernels.place_by_cell(piece.values, of_piece, place, ordered)
     return ordered, starts

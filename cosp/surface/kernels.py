@@ -324,42 +324,54 @@ def points_in_cells(
         result[n, 3] = weights[n]
 
 
+# Places in the lines of points, four numbers each: with a distance from point to point that the compiler knows, and
+# unsigned, for what cannot be negative need not be looked at as counted from the end.
+_ONE, _TWO, _THREE, _FOUR = (np.uint64(k) for k in (1, 2, 3, 4))
+
+
 @njit(nogil=True, cache=True)
 def count_by_cell(
-    points: Float32Array, row0: int, column0: int, shape: tuple[int, int], cells: IntArray, starts: IntArray
+    points: Float32Array, row0: int, column0: int, shape: tuple[int, int], cells: IntArray, counts: IntArray
 ) -> None:
-    """Write the cell of each of the points (N, 4) into `cells`, -1 for none, and count them one place further on.
+    """Write the cell of each of the points (N, 4) into `cells` and add one to its count.
 
-    A point belongs to the cell whose centre is nearest. Points outside the grid or without weight are left out.
-    `row0` and `column0` are the cell of the grid that the points' cell (0, 0) is.
+    A point belongs to the cell whose centre is nearest. Points outside the grid or without weight belong to one more
+    cell after the others. `row0` and `column0` are the cell of the grid that the points' cell (0, 0) is.
     """
     rows, columns = np.float32(shape[0]), np.float32(shape[1])
     more_rows, more_columns = np.float32(row0) + np.float32(0.5), np.float32(column0) + np.float32(0.5)
     zero = np.float32(0)
+    wide, nowhere = np.int32(shape[1]), np.int32(shape[0] * shape[1])
+    flat = points.reshape(-1)
     for n in range(points.shape[0]):
-        u = points[n, 0] + more_columns
-        v = points[n, 1] + more_rows
-        cell = -1
-        if u >= zero and u < columns and v >= zero and v < rows and points[n, 3] > zero and not np.isnan(points[n, 2]):
-            cell = int(v) * shape[1] + int(u)
-            starts[cell + 1] += 1
-        cells[n] = cell
+        k = _FOUR * np.uint64(n)
+        u = flat[k] + more_columns
+        v = flat[k + _ONE] + more_rows
+        z = flat[k + _TWO]
+        inside = (u >= zero) & (u < columns) & (v >= zero) & (v < rows) & (flat[k + _THREE] > zero) & (z == z)
+        u = u if inside else zero
+        v = v if inside else zero
+        cell = np.int32(np.int32(v) * wide + np.int32(u))
+        cells[n] = cell if inside else nowhere
+    # By itself, so that the loop above is worked on in vectors.
+    for n in range(points.shape[0]):
+        counts[cells[n]] += np.uint32(1)
 
 
 @njit(nogil=True, cache=True)
 def place_by_cell(points: Float32Array, cells: IntArray, place: IntArray, ordered: Float32Array) -> None:
     """Copy points to where the next ones of their cells go, with columns and rows from the cell's centre."""
+    half = np.float32(0.5)
     for n in range(points.shape[0]):
         cell = cells[n]
-        if cell >= 0:
+        if cell < place.size:
             k = place[cell]
-            place[cell] = k + 1
-            u = points[n, 0]
-            v = points[n, 1]
-            ordered[k, 0] = u - np.floor(u + np.float32(0.5))
-            ordered[k, 1] = v - np.floor(v + np.float32(0.5))
-            ordered[k, 2] = points[n, 2]
-            ordered[k, 3] = points[n, 3]
+            place[cell] = k + np.uint32(1)
+            u, v, z, w = points[n, 0], points[n, 1], points[n, 2], points[n, 3]
+            ordered[k, 0] = u - np.floor(u + half)
+            ordered[k, 1] = v - np.floor(v + half)
+            ordered[k, 2] = z
+            ordered[k, 3] = w
 
 
 @njit(nogil=True, cache=True)
@@ -392,24 +404,28 @@ def cell_medians(ordered: FloatArray, starts: IntArray, rows: int, columns: int)
 
     Medians here only say what lies far off, which a sample does as well. Of fewer points some count twice.
     """
-    medians = np.full((rows, columns), np.nan, np.float32)
+    medians = np.empty((rows, columns), np.float32)
+    # By rows of cells: first the nine of each, then the medians of many cells side by side.
+    taken = np.empty((9, columns), np.float32)
+    flat = ordered.reshape(-1)
     for row in range(rows):
         for column in range(columns):
-            start = starts[row * columns + column]
-            count = starts[row * columns + column + 1] - start
-            if count:
-                medians[row, column] = _median_of_nine(
-                    ordered[start, 2],
-                    ordered[start + count // 9, 2],
-                    ordered[start + 2 * count // 9, 2],
-                    ordered[start + 3 * count // 9, 2],
-                    ordered[start + 4 * count // 9, 2],
-                    ordered[start + 5 * count // 9, 2],
-                    ordered[start + 6 * count // 9, 2],
-                    ordered[start + 7 * count // 9, 2],
-                    ordered[start + 8 * count // 9, 2],
-                )
+            start, count = _points_of(starts, row * columns + column)
+            for n in range(9):
+                k = _FOUR * (start + np.uint64(n) * count // np.uint64(9))
+                taken[n, column] = flat[k + _TWO] if count else np.float32(np.nan)
+        a, b, c, d, e, f, g, h, i = taken
+        found = medians[row]
+        for n in range(columns):
+            missing = np.float32(0) * a[n]
+            found[n] = _median_of_nine(a[n], b[n], c[n], d[n], e[n], f[n], g[n], h[n], i[n]) + missing
     return medians
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _points_of(starts: IntArray, cell: int) -> tuple[np.uint64, np.uint64]:
+    """First point of a cell and how many there are, unsigned."""
+    return np.uint64(starts[cell]), np.uint64(starts[cell + 1] - starts[cell])
 
 
 @njit(nogil=True, cache=True)
@@ -497,29 +513,25 @@ def cell_scatter(
 ) -> FloatArray:
     """Median absolute distance, times 1.4826, of five points of each cell from its seed plane; NaN without points."""
     rows, columns = seeds.shape
-    scatter = np.full((rows, columns), np.nan, np.float32)
+    scatter = np.empty((rows, columns), np.float32)
+    taken = np.empty((5, columns), np.float32)
+    flat = ordered.reshape(-1)
     for row in range(rows):
         for column in range(columns):
-            start = starts[row * columns + column]
-            count = starts[row * columns + column + 1] - start
-            if count:
-                plane = seeds[row, column], along_columns[row, column], along_rows[row, column]
-                median = _median_of_five(
-                    _distance(ordered, start, plane),
-                    _distance(ordered, start + count // 5, plane),
-                    _distance(ordered, start + 2 * count // 5, plane),
-                    _distance(ordered, start + 3 * count // 5, plane),
-                    _distance(ordered, start + 4 * count // 5, plane),
-                )
-                scatter[row, column] = max(least, 1.4826 * median)
+            start, count = _points_of(starts, row * columns + column)
+            seed, slope_x, slope_y = seeds[row, column], along_columns[row, column], along_rows[row, column]
+            for n in range(5):
+                k = _FOUR * (start + np.uint64(n) * count // np.uint64(5))
+                above = np.float32(np.nan)
+                if count:
+                    above = flat[k + _TWO] - seed - slope_x * flat[k] - slope_y * flat[k + _ONE]
+                taken[n, column] = abs(above)
+        a, b, c, d, e = taken
+        found = scatter[row]
+        for n in range(columns):
+            missing = np.float32(0) * a[n]
+            found[n] = max(least, 1.4826 * _median_of_five(a[n], b[n], c[n], d[n], e[n])) + missing
     return scatter
-
-
-@njit(nogil=True, cache=True)
-def _distance(ordered: FloatArray, n: int, plane: tuple[float, float, float]) -> float:
-    """Height of a point above or below a plane of (height, slope along columns, slope along rows)."""
-    above: float = ordered[n, 2] - plane[0] - plane[1] * ordered[n, 0] - plane[2] * ordered[n, 1]
-    return abs(above)
 
 
 @njit(nogil=True, cache=True)
@@ -571,11 +583,11 @@ def _sum_points(
 ) -> None:
     """Fill sums (12, columns + 2 and more) with those of the cells of a row; cell c stands at c + 1."""
     columns = seeds.shape[1]
+    flat = ordered.reshape(-1)
     for column in range(columns):
         cell = row * columns + column
         if starts[cell + 1] == starts[cell]:
-            for k in range(_SUMS):
-                sums[k, column + 1] = 0.0
+            sums[:, column + 1] = 0.0
             continue
         seed = seeds[row, column]
         slope_x = along_columns[row, column]
@@ -584,11 +596,12 @@ def _sum_points(
         zero = np.float32(0)
         sw = sx = sy = sxx = sxy = syy = sz = sxz = syz = szz = points = zero
         for n in range(starts[cell], starts[cell + 1]):
-            x = ordered[n, 0]
-            y = ordered[n, 1]
-            z = ordered[n, 2] - seed - slope_x * x - slope_y * y
+            k = _FOUR * np.uint64(n)
+            x = flat[k]
+            y = flat[k + _ONE]
+            z = flat[k + _TWO] - seed - slope_x * x - slope_y * y
             kept = abs(z) <= limit
-            w = ordered[n, 3] if kept else zero
+            w = flat[k + _THREE] if kept else zero
             z = z if kept else zero
             wx = w * x
             wy = w * y
