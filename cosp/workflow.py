@@ -171,6 +171,13 @@ def site_file(project: Project, site: str, key: str) -> str | list[str]:
     return [] if path is None else path
 
 
+def wants_dem_control(project: Project, site: str) -> bool:
+    """Whether a site takes control from a draft of its own elevation model laid against the reference."""
+    options = project.settings["sites"][site]
+    wanted: str = options["dem_control"]
+    return wanted == "always" or (wanted == "without_reference_image" and options["reference_image"] is None)
+
+
 # What a rule's wildcards stand for ----------------------------------------------------------------------------------
 
 

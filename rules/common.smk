@@ -173,6 +173,15 @@ def of_pairs_of_block(pattern):
     return lambda wildcards: expand(pattern, pair=pairs_of_block(wildcards))
 
 
+def of_pairs_with_dem_control(pattern):
+    """Function that gives a file of every pair of a block that takes control from elevation models; none elsewhere."""
+    return lambda wildcards: (
+        of_pairs_of_block(pattern)(wildcards)
+        if house.wants_dem_control(project, house.site_of(project, wildcards))
+        else []
+    )
+
+
 def of_pairs_of_site(pattern):
     """Function that gives a file of every pair of a site."""
     return lambda wildcards: expand(pattern, pair=project.pairs_of_site(wildcards.site))

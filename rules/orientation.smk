@@ -35,6 +35,7 @@ rule adjust_bundle:
         neighbour_points=of_neighbours(
             "results/blocks/{block}/neighbours/{first}_{second}.parquet"
         ),
+        dem_gcps=of_pairs_with_dem_control("results/pairs/{pair}/dem_gcps.parquet"),
         reference_dem=of_site("reference_dem"),
         unstable_terrain=site_file("unstable_terrain"),
     output:
@@ -77,6 +78,79 @@ rule adjust_bundle:
         "Adjusting the cameras of {wildcards.block}"
     script:
         "../scripts/adjust_bundle.py"
+
+
+# First cameras, where a draft of the elevation model is to give more control.
+use rule adjust_bundle as adjust_draft with:
+    input:
+        gcps=of_block("results/scenes/{scene}/gcps.parquet"),
+        footprints=of_block("results/scenes/{scene}/footprint.json"),
+        films=of_block("results/scenes/{scene}/film.json"),
+        seams=of_block("results/scenes/{scene}/seams.json"),
+        tie_points=of_pairs_of_block("results/pairs/{pair}/tie_points.parquet"),
+        neighbour_points=of_neighbours(
+            "results/blocks/{block}/neighbours/{first}_{second}.parquet"
+        ),
+        dem_gcps=[],
+        reference_dem=of_site("reference_dem"),
+        unstable_terrain=site_file("unstable_terrain"),
+    output:
+        cameras=directory("results/blocks/{block}/draft/cameras"),
+        fields=directory("results/blocks/{block}/draft/fields"),
+        height_sigma=directory("results/blocks/{block}/draft/height_sigma"),
+        summary="results/blocks/{block}/draft/adjustment.json",
+        residuals="results/blocks/{block}/draft/residuals.parquet",
+        figure="results/blocks/{block}/draft/residuals.png",
+        field_figure="results/blocks/{block}/draft/film_fields.png",
+    log:
+        "logs/adjust_draft/{block}.log",
+    benchmark:
+        "benchmarks/adjust_draft/{block}.jsonl"
+    message:
+        "First cameras of {wildcards.block}"
+
+
+rule match_dem:
+    input:
+        fore_film=film_of("fore", "film.tif"),
+        aft_film=film_of("aft", "film.tif"),
+        cameras=block_file("draft/cameras"),
+        reference_dem=of_site("reference_dem"),
+        unstable_terrain=site_file("unstable_terrain"),
+    output:
+        gcps="results/pairs/{pair}/dem_gcps.parquet",
+        summary="results/pairs/{pair}/dem_gcps.json",
+        figure=report(
+            "results/pairs/{pair}/dem_gcps.png",
+            caption="../docs/captions/dem_gcps.rst",
+            category="Orientation",
+            labels={"pair": "{pair}", "figure": "draft model against the reference"},
+        ),
+    log:
+        "logs/match_dem/{pair}.log",
+    benchmark:
+        "benchmarks/match_dem/{pair}.jsonl"
+    conda:
+        "../envs/cosp.yaml"
+    threads: 2
+    resources:
+        mem_mb=2500,
+        runtime=30,
+    params:
+        **choices("match_dem"),
+        rectify=choices("rectify"),
+        y_parallax=choices("measure_y_parallax"),
+        dense=choices("match_dense"),
+        triangulate=choices("triangulate"),
+        grid_dem=choices("grid_dem"),
+        library=house.script_digest("match_dem"),
+        fore=member("fore"),
+        aft=member("aft"),
+        reference_dem_heights=of_site("reference_dem_heights"),
+    message:
+        "Control of {wildcards.pair} from a draft of its elevation model"
+    script:
+        "../scripts/match_dem.py"
 
 
 rule export_cameras:

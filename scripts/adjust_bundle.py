@@ -19,11 +19,13 @@ from cosp.geometry.grids import PixelGrid
 from cosp.imaging.resampling import sample
 from cosp.io import heights, rasters, records, tables, vectors
 from cosp.io.logs import log_to
+from cosp.matching.dem_control import SOURCE
 from cosp.report import figures
 from cosp.report.residuals import FilmResiduals, draw_residuals
 
 FIELD_GRID_MM = 5.0  # posting of the exported fields
 HEIGHT_SIGMA_MM = 10.0  # posting of the standard deviation of heights
+WITHHELD = "withheld"  # control by elevation models in blocks held out: no check, since it was measured with cameras
 
 
 def adjust_bundle(
@@ -66,6 +68,7 @@ def adjust_bundle(
     focal_sigma_mm,
     grid_step_mm,
     grid_radius_mm,
+    dem_gcps_paths=(),
 ):
     gcps = [tables.read(path) for path in gcp_paths]
     films = [records.read_json(path) for path in film_paths]
@@ -78,12 +81,17 @@ def adjust_bundle(
     origin = common_origin(placed)
     cameras = [camera.moved_to(origin) for camera in placed]
 
-    control, checks = (
+    if dem_gcps_paths:
+        of_dems = pd.concat([tables.read(path) for path in dem_gcps_paths], ignore_index=True)
+        gcps = [
+            with_dem_control(table, of_dems[of_dems.scene == scene]) for table, scene in zip(gcps, scenes, strict=True)
+        ]
+    control, checks, kept_back = (
         [
-            control_points(table[table.role == role], origin, pixel_mm)
+            control_points(table[table.role.isin(roles)], origin, pixel_mm)
             for table, pixel_mm in zip(gcps, pixels_mm, strict=True)
         ]
-        for role in ("control", "check")
+        for roles in (["control"], ["check"], ["check", WITHHELD])
     )
     stereo = [
         tie_points(tables.read(path), ("fore", "aft"), scenes.index(fore), scenes.index(aft), pixels_mm)
@@ -132,7 +140,7 @@ def adjust_bundle(
         check_errors(adjustment, checks, ties, held_out, reference, gate_sigma)
         for adjustment in (block.adjustment, block.plain)
     )
-    final = blocks.with_checks(block, control, checks, ties, prior_cameras=cameras, **choices)
+    final = blocks.with_checks(block, control, kept_back, ties, prior_cameras=cameras, **choices)
     summary = blocks.summary(
         block,
         final,
@@ -194,14 +202,30 @@ def common_origin(cameras):
     return LocalFrame(float(centres[0]), float(centres[1]))
 
 
+def with_dem_control(gcps, of_dems):
+    """Control of a film and what elevation models add, in the blocks of the film that are not held out."""
+    film = of_dems[["x_mm", "y_mm"]].to_numpy()
+    held_out = precision.in_held_out_blocks(
+        film, *(gcps.loc[gcps.role == role, ["x_mm", "y_mm"]].to_numpy() for role in ("control", "check"))
+    )
+    both = [gcps, of_dems.drop(columns="scene").assign(role=np.where(held_out, WITHHELD, "control"))]
+    return pd.concat([part for part in both if len(part)], ignore_index=True) if len(of_dems) else gcps
+
+
 def control_points(table, origin, pixel_mm):
+    """Control points of a table; of those by elevation models the covariance on the film says all."""
     ground = origin.local_from_geodetic(table[["longitude_deg", "latitude_deg", "height_m"]].to_numpy())
+    by_dem = table.source.to_numpy() == SOURCE
+    sigma_mm = pixel_mm * np.where(by_dem[:, None], table[["sigma_x_px", "sigma_y_px"]], 0.0)
+    covariance = sigma_mm[:, :, None] * sigma_mm[:, None, :]
+    covariance[:, [0, 1], [1, 0]] *= table.correlation_xy.to_numpy()[:, None]
     return Control(
         film_mm=table[["x_mm", "y_mm"]].to_numpy(),
         ground_m=ground,
         sigma_mm=table.sigma_px.to_numpy() * pixel_mm,
-        sigma_ground_m=table.sigma_ground_m.to_numpy(),
-        sigma_height_m=table.sigma_height_m.to_numpy(),
+        sigma_ground_m=np.where(by_dem, 0.0, table.sigma_ground_m),
+        sigma_height_m=np.where(by_dem, 0.0, table.sigma_height_m),
+        covariance_mm2=covariance,
     )
 
 
@@ -335,7 +359,7 @@ def gcp_residuals(camera, gcps, weights, pixel_mm):
     return pd.DataFrame(
         {
             "scene": camera.scene,
-            "group": "gcp",
+            "group": np.where(gcps.source == SOURCE, "dem", "gcp"),
             "role": role.astype(str),
             "x_mm": film[:, 0],
             "y_mm": film[:, 1],
@@ -409,6 +433,7 @@ if __name__ == "__main__":
             gcp_paths=list(snakemake.input.gcps),
             tie_paths=list(snakemake.input.tie_points),
             neighbour_paths=list(snakemake.input.neighbour_points),
+            dem_gcps_paths=list(snakemake.input.dem_gcps),
             footprint_paths=list(snakemake.input.footprints),
             film_paths=list(snakemake.input.films),
             seams_paths=list(snakemake.input.seams),

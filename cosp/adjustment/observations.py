@@ -25,6 +25,9 @@ class Control:
         Standard deviation of the film point, per axis.
     sigma_ground_m, sigma_height_m : (N,) arrays, m
         Standard deviations of the ground point, per horizontal axis and in height.
+    covariance_mm2 : (N, 2, 2) array, mm^2
+        What else the film point is wrong by, for ground points that are known better in some directions than in others;
+        nothing when left out.
     """
 
     film_mm: FloatArray
@@ -32,6 +35,11 @@ class Control:
     sigma_mm: FloatArray
     sigma_ground_m: FloatArray
     sigma_height_m: FloatArray
+    covariance_mm2: FloatArray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.covariance_mm2 is None:
+            object.__setattr__(self, "covariance_mm2", np.zeros((len(self.film_mm), 2, 2)))
 
     def __len__(self) -> int:
         return len(self.film_mm)

@@ -88,7 +88,7 @@ def control_rows(camera: PanoramicCamera, control: Control, image: int = 0, unkn
     film = camera.project(control.ground_m)
     by_camera, by_ground = camera_derivatives(camera, control.ground_m, film, unknowns)
     variance = np.stack([control.sigma_ground_m**2, control.sigma_ground_m**2, control.sigma_height_m**2], axis=1)
-    covariance = np.einsum("nik,nk,njk->nij", by_ground, variance, by_ground)
+    covariance = np.einsum("nik,nk,njk->nij", by_ground, variance, by_ground) + control.covariance_mm2
     covariance[:, [0, 1], [0, 1]] += control.sigma_mm[:, None] ** 2
     whiten = _whitening(covariance)
     return Rows(

@@ -315,16 +315,19 @@ def film_covariance(
     rise : (N, 2) array
         Rise of the ground per metre towards east and towards north; 0 where the height was not taken from a DEM.
     """
-    steps = _STEP_M * np.eye(3)
-    by_ground = np.stack(
-        [(camera.project(ground_m + step) - camera.project(ground_m - step)) / (2 * _STEP_M) for step in steps], axis=-1
-    )
+    by_ground = film_by_ground(camera.project, ground_m)
     # Film by plan, the height following the slope; film by the height alone.
     by_plan = by_ground[:, :, :2] + by_ground[:, :, 2:] * rise[:, None, :]
     plan = np.einsum("nij,nkj->nik", by_plan, by_plan) * ground_sigma_m[:, None, None] ** 2
     by_height = by_ground[:, :, 2]
     height = by_height[:, :, None] * by_height[:, None, :] * height_sigma_m[:, None, None] ** 2
     return np.asarray(match_sigma_mm[:, None, None] ** 2 * np.eye(2) + plan + height)
+
+
+def film_by_ground(project: Callable[[FloatArray], FloatArray], ground_m: FloatArray) -> FloatArray:
+    """Derivatives (N, 2, 3) of the film points that a function gives of ground points (N, 3), mm per metre."""
+    steps = _STEP_M * np.eye(3)
+    return np.stack([(project(ground_m + step) - project(ground_m - step)) / (2 * _STEP_M) for step in steps], axis=-1)
 
 
 def coverage(

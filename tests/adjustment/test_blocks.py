@@ -121,9 +121,13 @@ def gcp_table(camera, control, checks):
                     "latitude_deg": lonlath[:, 1],
                     "height_m": lonlath[:, 2],
                     "role": role,
+                    "source": "match",
                     "sigma_px": MATCH_PX,
                     "sigma_ground_m": GROUND_M,
                     "sigma_height_m": HEIGHT_M,
+                    "sigma_x_px": 1.0,
+                    "sigma_y_px": 1.0,
+                    "correlation_xy": 0.0,
                     "residual_x_px": np.nan,
                     "residual_y_px": np.nan,
                 }

@@ -40,7 +40,10 @@ class Rule:
 def _rules() -> list[Rule]:
     rules = []
     for path in RULE_FILES:
-        for block in re.split(r"^rule ", path.read_text(encoding="utf-8"), flags=re.M)[1:]:
+        for block in re.split(r"^(?=rule |use rule )", path.read_text(encoding="utf-8"), flags=re.M)[1:]:
+            if not block.startswith("rule "):
+                continue  # it is another one with other files
+            block = block.removeprefix("rule ")
             rule = Rule(name=block.split(":", 1)[0], text=block)
             for section in re.findall(r"^    (\w+):\n((?:^        .*\n|^\n)+)", block, flags=re.M):
                 names = set(re.findall(r"^        (\w+)=", section[1], flags=re.M))

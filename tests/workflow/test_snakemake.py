@@ -129,6 +129,24 @@ def test_files_of_a_site_that_is_not_simulated_are_the_users_wherever_they_lie(t
     assert "simulate_site" not in _jobs(done.stdout + done.stderr)
 
 
+def test_control_from_elevation_models_is_planned_where_it_is_chosen_alone(tmp_path: Path) -> None:
+    settings = _site(tmp_path, pairs=2, pixel_um=140)
+    here = settings["sites"]["here"]
+
+    def planned(wanted: str) -> tuple[int, int, int]:
+        here["dem_control"] = wanted
+        arguments = ["-n", "--configfile", _write(tmp_path, settings), "--directory", str(tmp_path)]
+        done = _snakemake(*arguments, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        jobs = _jobs(done.stdout + done.stderr)
+        return jobs["adjust_bundle"], jobs.get("adjust_draft", 0), jobs.get("match_dem", 0)
+
+    assert planned("always") == (1, 1, 2)
+    assert planned("without_reference_image") == planned("never") == (1, 0, 0)
+    del here["reference_image"]
+    assert planned("without_reference_image") == (1, 1, 2)
+
+
 def test_the_catalogs_snakefile_is_the_same_workflow(tmp_path: Path) -> None:
     settings = _site(tmp_path, pairs=1, pixel_um=140)
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(HOME / "workflow" / "Snakefile"), "-n"]
