@@ -31,6 +31,8 @@ _LEAST_SHARE = 0.4
 # Shading is not relief: below this part of the posting a shift says nothing.
 _FLOOR_PX = 0.25
 _SIGNIFICANCE = 4.0
+# Light is not quite relief, and cover goes with aspect: of what disturbs a single match, this part is common to all.
+_COMMON = 0.25
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class ReferenceShift:
     east_m, north_m : float
         What must be added to a place in the image to reach the same place in the DEM; NaN where it is not known.
     sigma_m : float
-        Standard deviation of either, from the spread between tiles.
+        Standard deviation of either, from the spread between tiles and what all of them may have in common.
     spread_m : float
         Of single matches about the shift, per coordinate.
     matches, tiles : int
@@ -149,7 +151,7 @@ def robust_shift(shifts_m: FloatArray, tile: IntArray, posting_m: float) -> Refe
     of_tiles = np.array([np.median(shifts_m[near & (tile == t)], axis=0) for t in tiles])
     spread = 1.4826 * float(np.median(np.abs(shifts_m[near] - centre)))
     between = 1.4826 * float(np.median(np.abs(of_tiles - np.median(of_tiles, axis=0))))
-    sigma = 1.25 * between / math.sqrt(len(tiles))  # 1.25: of a median
+    sigma = math.hypot(1.25 * between / math.sqrt(len(tiles)), _COMMON * spread)  # 1.25: of a median
     length = float(np.hypot(*centre))
     significant = length > max(_SIGNIFICANCE * sigma, _FLOOR_PX * posting_m)
     return ReferenceShift(

@@ -31,11 +31,16 @@ def shifted(world, east_m, north_m):
 
 @pytest.fixture(scope="module")
 def world():
-    rng = np.random.default_rng(3)
+    return lit_world(3, 148.0, 48.0)
+
+
+def lit_world(seed, azimuth_deg, elevation_deg):
+    """A world under a sun, half of whose brightness is cover; and its DEM."""
+    rng = np.random.default_rng(seed)
     rough = sum(s**1.5 * gaussian_filter(rng.standard_normal(GRID.shape), s, mode="wrap") for s in (3, 7, 16))
     heights = (1500 + 250 * rough / rough.std()).astype(np.float32)
     cover = texture(GRID.shape, rng) / 130.0
-    image = 0.6 * hillshade(heights, POSTING, 148.0, 48.0) + 60 * cover
+    image = 0.6 * hillshade(heights, POSTING, azimuth_deg, elevation_deg) + 60 * cover
     return World(GRID, image.astype(np.float32), heights + 2 * rng.standard_normal(GRID.shape).astype(np.float32))
 
 
@@ -47,6 +52,20 @@ def test_the_shift_of_an_image_is_found_and_its_significance_known(world, shift)
     assert found.significant == any(shift)
     np.testing.assert_allclose((found.east_m, found.north_m), (-shift[0], -shift[1]), atol=0.25 * POSTING)
     assert 0.1 < found.sigma_m < 0.2 * POSTING
+
+
+@pytest.mark.slow
+def test_the_standard_deviation_of_the_shift_is_what_it_is_wrong_by():
+    # Suns that are none of the four tried, and cover that is no relief.
+    ratios = []
+    for seed, sun in ((3, (148.0, 48.0)), (4, (245.0, 22.0)), (5, (20.0, 35.0)), (6, (148.0, 48.0))):
+        world = lit_world(seed, *sun)
+        shift = np.random.default_rng(seed).uniform(-150.0, 150.0, 2)
+        found = reference_shift(
+            shifted(world, *shift), world.on(world.heights), PLACES, posting_m=POSTING, search_m=250.0, threads=1
+        )
+        ratios.append((np.array([found.east_m, found.north_m]) + shift) / found.sigma_m)
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
 @pytest.mark.slow
