@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,10 +35,10 @@ class Control:
     sigma_mm: FloatArray
     sigma_ground_m: FloatArray
     sigma_height_m: FloatArray
-    covariance_mm2: FloatArray = None  # type: ignore[assignment]
+    covariance_mm2: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        if self.covariance_mm2 is None:
+        if not self.covariance_mm2.size:
             object.__setattr__(self, "covariance_mm2", np.zeros((len(self.film_mm), 2, 2)))
 
     def __len__(self) -> int:

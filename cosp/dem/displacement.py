@@ -242,9 +242,10 @@ def displacement(
     left = misfit - design @ solved
     scores = np.zeros((square.max() + 1, len(normal)))
     np.add.at(scores, squares, instruments * (weight * left)[:, None])
-    count = np.count_nonzero(scores.any(axis=1))
+    count = int(np.count_nonzero(scores.any(axis=1)))
     inverse = np.linalg.inv(normal)
-    spread = count / max(count - len(normal), 1) * inverse @ (scores.T @ scores) @ inverse.T
+    few = count / max(count - len(normal), 1)
+    spread = few * inverse @ (scores.T @ scores) @ inverse.T
     # From what the relief tells and height to east, north and up.
     turn = np.zeros((3, told.sum() + 1))
     turn[:2, :-1], turn[2, -1] = axes[:, told], 1.0
