@@ -211,6 +211,11 @@ def settings_for_page(wildcards):
     return house.settings_for_page(project, wildcards.site)
 
 
+def with_start_interval(given):
+    """An input that dense matching needs only where the reference DEM bounds its disparities."""
+    return given if choices("match_dense")["start_interval_m"] else []
+
+
 def memory(bytes_per_px):
     """Function that asks for memory by the size of the largest film that the job touches."""
     return lambda wildcards: house.memory_mb(

@@ -1,8 +1,3 @@
-def with_start_interval(given):
-    """An input that dense matching needs only where the reference DEM bounds its disparities."""
-    return given if choices("match_dense")["start_interval_m"] else []
-
-
 rule match_dense:
     input:
         fore="results/pairs/{pair}/fore_epipolar.tif",
