@@ -85,7 +85,7 @@ def plan_passes(span_px: float) -> list[Pass]:
     """Levels and ranges that find any disparity of a span, coarsest first.
 
     The coarsest level searches everything, then once more what that left over, now that slopes are flat. Mistakes of
-    the coarse levels last and their work is little, so those search widely, and all but the last of them twice.
+    the coarse levels last and their work is little, so those search widely, and twice.
     """
     levels = _FEWEST_LEVELS
     while span_px / 2**levels + 2 * _SLACK_PX > 2 * LEFT_OVER:
@@ -95,8 +95,7 @@ def plan_passes(span_px: float) -> list[Pass]:
     for level in range(levels - 1, -1, -1):
         if level >= 2:
             passes.append(Pass(level, 2 * LEFT_OVER))
-        if level != 2:
-            passes.append(Pass(level, LEFT_OVER))
+        passes.append(Pass(level, LEFT_OVER))
     return passes
 
 
