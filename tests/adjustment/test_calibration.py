@@ -275,7 +275,8 @@ def test_frames_of_one_camera_share_what_they_have_in_common():
         film = rng.uniform([-340, -26], [340, 26], (count, 2))
         measured = film + common(film) + rng.normal(0.0, 0.7 * PIXEL_MM, film.shape)
         part = {"sigma_mm": 0.7 * PIXEL_MM, "sigma_ground_m": 0.5, "sigma_height_m": 0.5}
-        points = replace(simulated[0].control[0], film_mm=measured, ground_m=on_terrain(fore, film))
+        ground, nothing = on_terrain(fore, film), np.empty(0)
+        points = replace(simulated[0].control[0], film_mm=measured, ground_m=ground, covariance_mm2=nothing)
         control.append(replace(points, **{name: np.full(count, value) for name, value in part.items()}))
     cameras = [replace(fore, scene=f"frame {n}") for n in range(3)]
 
