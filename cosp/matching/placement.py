@@ -114,6 +114,8 @@ class SearchLimits:
         Least number and share of matches that agree with one camera.
     min_block_share : float
         Least share of the film's blocks with matches in which most of them agree.
+    max_sigma_m : float
+        While more evidence is to come, a place is not taken that is known worse than that at an end of the film.
     """
 
     coarse_posting_m: float
@@ -123,6 +125,7 @@ class SearchLimits:
     min_agreeing: int
     min_agreeing_share: float
     min_block_share: float
+    max_sigma_m: float
 
     @classmethod
     def of(cls, choices: object) -> SearchLimits:
@@ -368,7 +371,8 @@ class _Follower:
     ) -> Footprint:
         """The one place that the film's own matches agree on.
 
-        While more evidence is to come (`last` is not set) only a place on which most of them agree is taken.
+        While more evidence is to come (`last` is not set) only a place is taken on which most of them agree, and which
+        they tell all over the film.
 
         Raises
         ------
@@ -416,7 +420,13 @@ class _Follower:
             placement = finer
         if evidence.name == "relief":
             placement = self._sharpened(way, evidence, placement)
-        return self._record(best.candidate, evidence, placement, found.rival_score(best.candidate), margin)
+        footprint = self._record(best.candidate, evidence, placement, found.rival_score(best.candidate), margin)
+        if not last and footprint.sigma_m > limits.max_sigma_m:
+            raise PlacementError(
+                f"{head}{int(placement.agreeing.sum())} matches agree with one place, but leave an end of the film "
+                f"open by {footprint.sigma_m:.0f} m; {limits.max_sigma_m:.0f} m are needed before all is searched"
+            )
+        return footprint
 
     def _tried(self, guesses: Sequence[_Guess], posting_m: float) -> list[tuple[_Guess, _Evidence, _Placement]]:
         """The best few places at the next posting, the one with most agreeing matches first."""

@@ -34,7 +34,7 @@ from tests.matching.conftest import CRS, World, make_camera, moved
 WORLD_POSTING_M = 120.0
 LIMITS = SearchLimits(
     coarse_posting_m=240.0, fine_posting_m=85.0, min_score=5.0, min_margin=2.0, min_agreeing=12,
-    min_agreeing_share=0.3, min_block_share=0.5,
+    min_agreeing_share=0.3, min_block_share=0.5, max_sigma_m=300.0,
 )  # fmt: skip
 PIXEL_MM = 0.3
 # A film whose usable ground is placed within this of the truth, in millimetres of film, is placed right: five pixels of

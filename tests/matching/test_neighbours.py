@@ -75,7 +75,7 @@ def test_films_of_one_camera_lie_alike_and_a_frame_known_by_them_alone_says_so()
 def test_a_smaller_window_needs_a_lower_score_for_the_same_chance():
     # Expected maxima of n independent normal values, n being the window's area.
     maxima = [np.sqrt(2 * np.log(area)) for area in (200.0**2, 20.0**2)]
-    limits = SearchLimits(240.0, 30.0, float(maxima[0]), 2.0, 12, 0.3, 0.5)
+    limits = SearchLimits(240.0, 30.0, float(maxima[0]), 2.0, 12, 0.3, 0.5, 300.0)
     assert limits.in_window(100.0, 10.0).min_score == pytest.approx(maxima[1])
     assert limits.in_window(100.0, 100.0) == limits
     assert limits.in_window(100.0, 1.0).min_score < maxima[1]

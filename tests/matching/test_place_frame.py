@@ -17,7 +17,7 @@ from .conftest import CRS, make_camera, moved, texture
 
 LIMITS = SearchLimits(
     coarse_posting_m=240.0, fine_posting_m=80.0, min_score=8.0, min_margin=2.0, min_agreeing=12,
-    min_agreeing_share=0.3, min_block_share=0.5,
+    min_agreeing_share=0.3, min_block_share=0.5, max_sigma_m=300.0,
 )  # fmt: skip
 CHOICES = {
     "day": None, "reference_dem_heights": "ellipsoidal", "search_km": 100, "limits": LIMITS, "seed": 1, "threads": 1,

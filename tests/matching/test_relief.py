@@ -22,7 +22,7 @@ from .conftest import CRS, World, make_camera, moved, texture
 POSTING = 60.0
 LIMITS = SearchLimits(
     coarse_posting_m=240.0, fine_posting_m=80.0, min_score=5.5, min_margin=2.0, min_agreeing=12,
-    min_agreeing_share=0.3, min_block_share=0.5,
+    min_agreeing_share=0.3, min_block_share=0.5, max_sigma_m=300.0,
 )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Placement of whole films: a synthetic world, coarse films, and predictions that are far off."""
 
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -24,11 +25,13 @@ def film(world, camera):
 
 LIMITS = SearchLimits(
     coarse_posting_m=240.0, fine_posting_m=80.0, min_score=5.5, min_margin=3.0, min_agreeing=20,
-    min_agreeing_share=0.3, min_block_share=0.5,
+    min_agreeing_share=0.3, min_block_share=0.5, max_sigma_m=300.0,
 )  # fmt: skip
 
 
-def locate(film, predicted, world, *, reference=None, heights=None, search_m=8000.0, with_image=True, day=None):
+def locate(
+    film, predicted, world, *, reference=None, heights=None, search_m=8000.0, with_image=True, day=None, limits=LIMITS
+):
     located = locate_film(
         film,
         predicted,
@@ -37,7 +40,7 @@ def locate(film, predicted, world, *, reference=None, heights=None, search_m=800
         day=day,
         crs=CRS,
         search_m=search_m,
-        limits=LIMITS,
+        limits=limits,
         rng=np.random.default_rng(0),
         threads=1,
     )
@@ -103,6 +106,25 @@ def test_a_changed_negative_reference_still_places_the_film(film, camera, world)
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_a_place_that_leaves_an_end_of_the_film_open_is_taken_after_a_search_of_everything(camera, world, film, caplog):
+    pixels = film.read(Window(0, film.grid.shape[0], 0, film.grid.shape[1])).copy()
+    pixels[:, : round(0.6 * pixels.shape[1])] = 0
+    half, predicted = FilmImage.from_array(pixels, film.grid), moved(camera, -1000.0, 800.0)
+    found = []
+    caplog.set_level("INFO")
+    for max_sigma_m in (1000.0, 30.0):
+        caplog.clear()
+        limits = replace(LIMITS, max_sigma_m=max_sigma_m)
+        found.append(locate(half, predicted, world, search_m=4000.0, limits=limits))
+        assert ("leave an end of the film open by" in caplog.text) == (max_sigma_m == 30.0)
+    assert found[0].sigma_m > 100.0
+    assert found[1].sigma_m <= found[0].sigma_m
+    for footprint in found:
+        error_m = film_error_px(footprint.camera, camera).max() * ground_pixel_m(camera, FILM_PIXEL_MM, 0.0)
+        assert error_m < 3 * footprint.sigma_m
+
+
 def test_noise_is_refused(camera, world):
     rng = np.random.default_rng(4)
     columns, rows = round(2 * camera.half_length_mm / FILM_PIXEL_MM), round(2 * camera.half_width_mm / FILM_PIXEL_MM)
