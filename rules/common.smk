@@ -216,6 +216,21 @@ def with_start_interval(given):
     return given if choices("match_dense")["start_interval_m"] else []
 
 
+# What both adjustments of a block start from.
+OBSERVATIONS_OF_BLOCK = {
+    "gcps": of_block("results/scenes/{scene}/gcps.parquet"),
+    "footprints": of_block("results/scenes/{scene}/footprint.json"),
+    "films": of_block("results/scenes/{scene}/film.json"),
+    "seams": of_block("results/scenes/{scene}/seams.json"),
+    "tie_points": of_pairs_of_block("results/pairs/{pair}/tie_points.parquet"),
+    "neighbour_points": of_neighbours(
+        "results/blocks/{block}/neighbours/{first}_{second}.parquet"
+    ),
+    "reference_dem": of_site("reference_dem"),
+    "unstable_terrain": site_file("unstable_terrain"),
+}
+
+
 def memory(bytes_per_px):
     """Function that asks for memory by the size of the largest film that the job touches."""
     return lambda wildcards: house.memory_mb(

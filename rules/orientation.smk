@@ -27,17 +27,8 @@ rule predict_camera:
 
 rule adjust_bundle:
     input:
-        gcps=of_block("results/scenes/{scene}/gcps.parquet"),
-        footprints=of_block("results/scenes/{scene}/footprint.json"),
-        films=of_block("results/scenes/{scene}/film.json"),
-        seams=of_block("results/scenes/{scene}/seams.json"),
-        tie_points=of_pairs_of_block("results/pairs/{pair}/tie_points.parquet"),
-        neighbour_points=of_neighbours(
-            "results/blocks/{block}/neighbours/{first}_{second}.parquet"
-        ),
+        **OBSERVATIONS_OF_BLOCK,
         dem_gcps=of_pairs_with_dem_control("results/pairs/{pair}/dem_gcps.parquet"),
-        reference_dem=of_site("reference_dem"),
-        unstable_terrain=site_file("unstable_terrain"),
     output:
         cameras=directory("results/blocks/{block}/cameras"),
         fields=directory("results/blocks/{block}/fields"),
@@ -83,17 +74,8 @@ rule adjust_bundle:
 # First cameras, where a draft of the elevation model is to give more control.
 use rule adjust_bundle as adjust_draft with:
     input:
-        gcps=of_block("results/scenes/{scene}/gcps.parquet"),
-        footprints=of_block("results/scenes/{scene}/footprint.json"),
-        films=of_block("results/scenes/{scene}/film.json"),
-        seams=of_block("results/scenes/{scene}/seams.json"),
-        tie_points=of_pairs_of_block("results/pairs/{pair}/tie_points.parquet"),
-        neighbour_points=of_neighbours(
-            "results/blocks/{block}/neighbours/{first}_{second}.parquet"
-        ),
+        **OBSERVATIONS_OF_BLOCK,
         dem_gcps=[],
-        reference_dem=of_site("reference_dem"),
-        unstable_terrain=site_file("unstable_terrain"),
     output:
         cameras=directory("results/blocks/{block}/draft/cameras"),
         fields=directory("results/blocks/{block}/draft/fields"),

@@ -13,7 +13,7 @@ from cosp.film.exposure import Exposure
 from cosp.film.joining import Layout
 from cosp.film.stripes import Trace
 from cosp.geometry.statistics import nmad
-from cosp.imaging.windows import tiles
+from cosp.imaging.windows import tiles, worked_on
 from cosp.io import rasters, records, tables
 from cosp.io.logs import log_to
 from cosp.report import figures
@@ -90,11 +90,9 @@ def correct_bending(
         rasters.create(film_path, shape=grid.shape, dtype="uint8", grid=grid, crs=rasters.FILM_CRS, nodata=0) as film,
         ThreadPoolExecutor(threads) as pool,
     ):
-        for start in range(0, len(windows), threads):
-            batch = windows[start : start + threads]
-            for window, values in zip(batch, pool.map(straight, batch), strict=True):
-                film.write(window, values)
-            log.info("straightened %d/%d windows", min(start + threads, len(windows)), len(windows))
+        for number, (window, values) in enumerate(worked_on(pool, straight, windows, ahead=threads), 1):
+            film.write(window, values)
+            log.info("straightened %d/%d windows", number, len(windows))
 
     records.write(
         summary_path,

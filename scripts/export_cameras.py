@@ -14,7 +14,7 @@ from cosp.camera.panoramic import PanoramicCamera
 from cosp.camera.tsai import tsai_text
 from cosp.errors import NoOverlapError
 from cosp.geometry.grids import PixelGrid
-from cosp.imaging.windows import Window, tiles
+from cosp.imaging.windows import Window, tiles, worked_on
 from cosp.io import rasters, records, views
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
@@ -94,8 +94,8 @@ def write_image(stem, film_path, grid, field, threads):
     path = stem.with_suffix(".tif")
     windows = tiles(grid.shape, TILE_PX)
 
-    def ideal(window, measured):
-        return without_field(field, grid, window, measured)
+    def ideal(window):
+        return without_field(field, grid, window, rasters.read(film_path, window=measured_window(field, grid, window)))
 
     with (
         rasters.create(
@@ -103,11 +103,8 @@ def write_image(stem, film_path, grid, field, threads):
         ) as image,
         ThreadPoolExecutor(threads) as pool,
     ):
-        for start in range(0, len(windows), threads):
-            batch = windows[start : start + threads]
-            sources = [rasters.read(film_path, window=measured_window(field, grid, window)) for window in batch]
-            for window, values in zip(batch, pool.map(ideal, batch, sources), strict=True):
-                image.write(window, values)
+        for window, values in worked_on(pool, ideal, windows, ahead=threads):
+            image.write(window, values)
     return path
 
 

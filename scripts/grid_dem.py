@@ -15,13 +15,12 @@ from cosp.geometry.mapping import utm_crs
 from cosp.imaging.windows import Window, tiles, worked_on
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
-from cosp.surface.gridding import HALO_CELLS, CellPoints, boxes_meeting, grid_cells, map_boxes
+from cosp.surface.gridding import HALO_CELLS, CellPoints, boxes_meeting, confidence_weights, grid_cells, map_boxes
 from cosp.surface.intersection import PixelIntersection
 from cosp.surface.orthophoto import film_of_cells
 
 CONFIDENCE_BAND = 2  # of validity.tif
 SMOOTH_BAND = 2  # of y_parallax.tif: the field that dense matching allowed for
-MOST_CONFIDENCE = 255
 TILE_M = 5000.0  # ground of one job of a thread: about five million points of a 7 um film
 WINDOWS_AT_HAND = 40  # whose points are kept for the tiles to come: up to 17 MB each
 
@@ -74,9 +73,7 @@ def grid_dem(
         projector = MapProjector(fore, crs, grid.bounds)
         of_cameras = records.read(height_sigma_path, HeightSigma)
 
-    # The noise of matching falls as confidence rises.
-    weights = (np.arange(MOST_CONFIDENCE + 1) / MOST_CONFIDENCE) ** 2
-    weights[:least_confidence] = 0.0
+    weights = confidence_weights(least_confidence)
 
     def map_points(number):
         """Points of a window in cells of the grid."""
@@ -101,8 +98,8 @@ def grid_dem(
         )
         return grown, grid.window(grown.row0, grown.row1, grown.column0, grown.column1)
 
-    def heights(tile):
-        grown, pieces = needed.pop(tile)
+    def heights(work):
+        tile, grown, pieces = work
         found = grid_cells(
             [piece.result() for piece in pieces],
             grown,
@@ -128,7 +125,6 @@ def grid_dem(
     options = {"shape": grid.shape, "dtype": "float32", "grid": grid, "crs": crs, "tags": tags, "cog": True}
     options["threads"] = threads
     at_hand = {}  # points of windows, there or to come, that tiles in work need and the next ones may
-    needed = {}  # by tile: the tile with its halo, and the points that it is made of
     filled = 0
     with (
         rasters.create(dem_path, descriptions=["height_m"], **options) as dem,
@@ -137,7 +133,7 @@ def grid_dem(
     ):
 
         def prepared():
-            """Tiles one by one, the points of each on their way."""
+            """Tiles one by one, each with its halo and the points it is made of, which are on their way."""
             for tile in every:
                 grown, part = with_halo(tile)
                 meeting = boxes_meeting(boxes, part.bounds)
@@ -147,11 +143,10 @@ def grid_dem(
                 for number in meeting:
                     if number not in at_hand:
                         at_hand[number] = pool.submit(map_points, number)
-                needed[tile] = grown, [at_hand[number] for number in meeting]
-                yield tile
+                yield tile, grown, [at_hand[number] for number in meeting]
 
         # Work begins in the order in which it was given, so tiles never wait for points that wait for a thread.
-        for number, (tile, (height_m, sigma_m, count, camera_sigma_m)) in enumerate(
+        for number, ((tile, _, _), (height_m, sigma_m, count, camera_sigma_m)) in enumerate(
             worked_on(pool, heights, prepared(), ahead=2 * threads), 1
         ):
             dem.write(tile, height_m)

@@ -27,7 +27,7 @@ from cosp.matching.film_image import FilmImage
 from cosp.matching.ground import Terrain, grown, map_bounds, map_crs
 from cosp.report.displacement import draw_displacements
 from cosp.report.figures import save
-from cosp.surface.gridding import CellPoints, grid_cells
+from cosp.surface.gridding import CellPoints, confidence_weights, grid_cells
 from cosp.surface.intersection import PixelIntersection, height_per_pixel, miss_limit, pixel_on_ground
 
 log = logging.getLogger("match_dem")
@@ -158,7 +158,7 @@ def draft_model(
         virtual_conjugates(*mappings, np.linspace(low, high, LEVELS), even=bool(total)),
         mappings,
         pixel_mm=min(film.pixel_mm for film in films),
-        basis=Basis(total, total, total=True) if total else Basis(rectify["degree_across"], rectify["degree_along"]),
+        basis=Basis.of_film(across=rectify["degree_across"], along=rectify["degree_along"], total=total),
         disparity_margin_px=rectify["disparity_margin_px"],
     )
     pictures = []
@@ -206,8 +206,7 @@ def draft_model(
     if not np.isfinite(sampled).any():
         raise NotEnoughMatchesError("dense matching of the reduced films found nothing")
 
-    weights = (np.arange(256) / 255) ** 2
-    weights[: grid_dem["least_confidence"]] = 0.0
+    weights = confidence_weights(grid_dem["least_confidence"])
     posting_m = max(dem_posting_m, PIXELS_A_CELL * ground_px_m)
     spread = map_frame.map_from_local(sampled[np.isfinite(sampled).all(axis=-1)])
     grid = PixelGrid.covering((*spread[:, :2].min(axis=0), *spread[:, :2].max(axis=0)), posting_m)

@@ -65,8 +65,7 @@ def rectify(
         virtual_conjugates(*films, np.linspace(low, high, LEVELS), even=bool(total_degree)),
         films,
         pixel_mm=pixel_mm,
-        # Epipolar lines run across the film.
-        basis=Basis(total_degree, total_degree, total=True) if total_degree else Basis(degree_across, degree_along),
+        basis=Basis.of_film(across=degree_across, along=degree_along, total=total_degree),
         disparity_margin_px=disparity_margin_px,
     )
     log.info(

@@ -27,6 +27,11 @@ class Basis:
     degree_v: int
     total: bool = False
 
+    @classmethod
+    def of_film(cls, *, across: int, along: int, total: int) -> Basis:
+        """Of degrees across a film (as epipolar lines run) and along it; of a total degree where it is not 0."""
+        return cls(total, total, total=True) if total else cls(across, along)
+
     @property
     def terms(self) -> BoolArray:
         """(degree_u + 1, degree_v + 1) array: True where T_i(u) T_j(v) is used."""

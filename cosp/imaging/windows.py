@@ -12,6 +12,7 @@ import numpy as np
 
 from cosp.arrays import FloatArray
 
+WorkT = TypeVar("WorkT")
 ResultT = TypeVar("ResultT")
 
 
@@ -77,22 +78,22 @@ def strip_of(length: int, scatteritem: str) -> tuple[int, int]:
 
 
 def worked_on(
-    pool: Executor, function: Callable[[Window], ResultT], windows: Iterable[Window], *, ahead: int
-) -> Iterator[tuple[Window, ResultT]]:
-    """Windows and what a function makes of them, in their order, while the next ones are worked on.
+    pool: Executor, function: Callable[[WorkT], ResultT], works: Iterable[WorkT], *, ahead: int
+) -> Iterator[tuple[WorkT, ResultT]]:
+    """Pieces of work, such as windows, and what becomes of them, in their order, while the next ones are worked on.
 
     Parameters
     ----------
     pool : Executor
-    function : function of a window
-    windows : iterable of Window
+    function : function of a piece of work
+    works : iterable
         Asked for one by one, each when its work can begin.
     ahead : int
-        Windows in work or done that wait for their turn at most; bounds the memory.
+        Pieces in work or done that wait for their turn at most; bounds the memory.
     """
-    waiting: deque[tuple[Window, Future[ResultT]]] = deque()
-    for window in windows:
-        waiting.append((window, pool.submit(function, window)))
+    waiting: deque[tuple[WorkT, Future[ResultT]]] = deque()
+    for work in works:
+        waiting.append((work, pool.submit(function, work)))
         if len(waiting) > ahead:
             done, result = waiting.popleft()
             yield done, result.result()

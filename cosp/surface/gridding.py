@@ -18,6 +18,7 @@ from cosp.surface import kernels
 
 HALO_CELLS = 4  # what `grid_points` needs around a tile to give the heights of the whole
 
+_MOST_CONFIDENCE = 255
 _SLOPE_WEIGHT = 0.1  # points; holds slopes where the points lie on a line, without a say elsewhere
 _NEIGHBOURS_TO_FILL = 5  # of 8: closes holes of a cell and slits of one cell, does not grow the edge
 
@@ -101,6 +102,13 @@ def grid_points(
 def cells_of(grid: PixelGrid) -> tuple[float, float, float, float]:
     """Coordinates (x, y) of the centre of cell (0, 0), and cells per unit of either."""
     return grid.x0, grid.y0, 1 / grid.step_x, 1 / grid.step_y
+
+
+def confidence_weights(least_confidence: int) -> FloatArray:
+    """Weights (256,) of points by the confidence of their match, whose noise falls as that rises; 0 below the least."""
+    weights = (np.arange(_MOST_CONFIDENCE + 1) / _MOST_CONFIDENCE) ** 2
+    weights[:least_confidence] = 0.0
+    return weights
 
 
 def grid_cells(

@@ -37,6 +37,14 @@ class Rule:
         return (HOME / "scripts" / f"{self.script_name}.py").read_text(encoding="utf-8")
 
 
+def _keys(shared: str) -> set[str]:
+    """Of a dictionary that several rules take their files from."""
+    common = (HOME / "rules" / "common.smk").read_text(encoding="utf-8")
+    found = re.search(rf"^{shared} = \{{\n(.*?)^\}}", common, flags=re.M | re.S)
+    assert found, f"rules/common.smk defines no {shared}"
+    return set(re.findall(r"^    \"(\w+)\":", found[1], flags=re.M))
+
+
 def _rules() -> list[Rule]:
     rules = []
     for path in RULE_FILES:
@@ -49,6 +57,8 @@ def _rules() -> list[Rule]:
                 names = set(re.findall(r"^        (\w+)=", section[1], flags=re.M))
                 for choices in re.findall(r'^        \*\*choices\("(\w+)"\)', section[1], flags=re.M):
                     names |= set(sheets.schema("config")["properties"][choices].get("properties", {}))
+                for shared in re.findall(r"^        \*\*(\w+),", section[1], flags=re.M):
+                    names |= _keys(shared)
                 rule.names[section[0]] = names
             rules.append(rule)
     return rules
