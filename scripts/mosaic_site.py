@@ -263,13 +263,8 @@ def pieces(paths, infos, grid, window, missing):
     for path, info in zip(paths, infos, strict=True):
         row, column = (round(float(v)) for v in grid.pixels((info.grid.x0, info.grid.y0)))
         whole = Window(row, row + info.shape[0], column, column + info.shape[1])
-        part = Window(
-            max(window.row0, whole.row0),
-            min(window.row1, whole.row1),
-            max(window.column0, whole.column0),
-            min(window.column1, whole.column1),
-        )
-        if part.row0 < part.row1 and part.column0 < part.column1:
+        part = window.common(whole)
+        if min(part.shape) > 0:
             values = rasters.read(path, window=part.inside(whole))
             if (np.isfinite(values) if np.isnan(missing) else values != missing).any():
                 piece = np.full(window.shape, missing)

@@ -52,6 +52,7 @@ LEFT_OVER = 32
 FRACTIONS = 64
 """Disparities are rounded to this part of a pixel, a tenth of their noise, so that files compress."""
 
+_SEEN_PX = 16  # how far the windows of masks, and the census of what they look at, reach
 _SLACK_PX = 8  # coarse pixels searched beyond the range on either side; columns resampled beyond what is searched
 _FEWEST_LEVELS = 2
 _NO_FIELD = SmoothField(np.zeros((1, 1), np.float32), 0.0, 0.0, 1.0, 1.0)
@@ -182,12 +183,18 @@ def match(
             tile_px=tile_px,
             pool=pool,
         )
-        result = DisparityMap(np.empty(seen.shape, np.float32), *(np.empty(seen.shape, np.uint8) for _ in range(3)))
+        result = DisparityMap(
+            np.full(seen.shape, np.nan, np.float32),
+            np.full(seen.shape, int(Validity.NO_DATA_LEFT), np.uint8),
+            *(np.zeros(seen.shape, np.uint8) for _ in range(2)),
+        )
 
         def finish(window: Window) -> None:
-            grown = window.grown(HALO_PX, left.shape)
-            inside = window.inside(grown).slices
-            target = window.inside(seen).slices
+            grown, part = _with_halo(left, window)
+            if min(part.shape) == 0:
+                return
+            inside = part.inside(grown).slices
+            target = part.inside(seen).slices
             with workspace() as memory:
                 tile = _cleaned(
                     last.left[grown.slices],
@@ -257,9 +264,10 @@ def _coarse_to_fine(
         coarse = np.full(lefts[step.level].shape, np.nan, np.float32)
 
         def keep(window: Window, task: _Task = task, coarse: Float32Array = coarse) -> None:
-            grown = window.grown(HALO_PX, coarse.shape)
-            with workspace() as memory:
-                coarse[window.slices] = _matched(task, grown, memory)[0].disparity[window.inside(grown).slices]
+            grown, part = _with_halo(task.left, window)
+            if min(part.shape) > 0:
+                with workspace() as memory:
+                    coarse[part.slices] = _matched(task, grown, memory)[0].disparity[part.inside(grown).slices]
 
         _log.info("level %d: %d disparities", step.level, step.disparities)
         # The volume of a tile stays the same.
@@ -338,6 +346,18 @@ def _over_tiles(
         _log.debug("tile %d/%d", done, len(windows))
 
 
+def _with_halo(picture: ByteArray, tile: Window) -> tuple[Window, Window]:
+    """What is to be matched for a tile, and the part of the tile that this covers: all of it that has data."""
+    grown = tile.grown(HALO_PX, picture.shape)
+    column, row, columns, rows = cv2.boundingRect(picture[grown.slices])
+    row, column = row + grown.row0, column + grown.column0
+    data = Window(row, row + rows, column, column + columns)
+    if rows > 0:  # and what windows about a pixel with data look at
+        data = data.grown(_SEEN_PX, picture.shape)
+    grown = grown.common(data)
+    return grown, tile.common(grown)
+
+
 def _matched(
     task: _Task, window: Window, memory: Workspace, *, least_texture_sd: float | None = None, saturated_from: int = 256
 ) -> tuple[DisparityMap, ByteArray]:
@@ -346,10 +366,6 @@ def _matched(
     Without a least texture only data and consistency are asked for, as a prior needs.
     """
     left = np.ascontiguousarray(task.left[window.slices])
-    if not left.any():
-        outside = np.full(left.shape, int(Validity.NO_DATA_LEFT), np.uint8)
-        nothing = np.zeros_like(left)
-        return DisparityMap(np.full(left.shape, np.nan, np.float32), outside, nothing, nothing), nothing
     disparities = task.step.disparities
     margin = disparities // 2 + _SLACK_PX
     wide = Window(window.row0, window.row1, window.column0 - margin, window.column1 + margin)

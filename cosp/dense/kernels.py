@@ -1366,8 +1366,8 @@ def fill_from(values: Any, coarse: Any) -> None:
 def continue_rows(values: Any, reach: int, base: int, steepest: float) -> None:
     """Go on in a straight line from the first and the last value of every row into what is NaN beyond, in place.
 
-    The line is that of the outermost `base` columns and rises by at most `steepest` a column; rows that know less than
-    half of these columns stay as they are.
+    The line is that of the outermost `base` columns, rises by at most `steepest` a column and is level from `reach`
+    columns on; rows that know less than half of these columns stay as they are.
     """
     rows, columns = values.shape
     for row in range(rows):
@@ -1392,11 +1392,10 @@ def continue_rows(values: Any, reach: int, base: int, steepest: float) -> None:
             slope = (count * sum_tv - sum_t * sum_v) / (count * sum_tt - sum_t * sum_t)
             slope = min(max(slope, -steepest), steepest)
             start = (sum_v - slope * sum_t) / count
-            for t in range(1, reach + 1):
-                column = first - step * t
-                if not 0 <= column < columns:
-                    break
-                values[row, column] = start - slope * t
+            column = first - step
+            while 0 <= column < columns:
+                values[row, column] = start - slope * min(step * (first - column), reach)
+                column -= step
 
 
 @njit(nogil=True, cache=True)

@@ -179,7 +179,8 @@ def continue_beyond_edges(disparity: Float32Array) -> None:
     """Let the disparity of every row go on beyond its first and last match as it slopes there, in place.
 
     At film edges the next pass has nothing else to go by. Closed like other holes, from the mean of what is near, it
-    would be flat there, and pull matches near the edge inwards.
+    would be flat there, and pull matches near the edge inwards. Further out it stays as it is where that reach ends, so
+    that left pixels beyond an edge do not fall back on right ones within, and contest them.
     """
     kernels.continue_rows(disparity, _EDGE_REACH_PX, _EDGE_BASE_PX, _STEEPEST)
 

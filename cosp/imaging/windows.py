@@ -44,6 +44,13 @@ class Window:
             min(self.column1 + halo, shape[1]),
         )
 
+    def common(self, other: Window) -> Window:
+        """What both windows cover; without rows or columns where that is nothing."""
+        row0, column0 = max(self.row0, other.row0), max(self.column0, other.column0)
+        return Window(
+            row0, max(min(self.row1, other.row1), row0), column0, max(min(self.column1, other.column1), column0)
+        )
+
     def inside(self, outer: Window) -> Window:
         """Rows and columns counted from the corner of an outer window."""
         return Window(

@@ -112,16 +112,13 @@ def _by_blocks(on_grid: OnGrid, bounds: tuple[float, float, float, float]) -> On
         if not aligned or max(grid.shape) > _BLOCK:
             return on_grid(grid)
         rows, columns = grid.shape
+        wanted = Window(row0, row0 + rows, column0, column0 + columns)
         result = np.empty(grid.shape, np.float32)
         for i in range(row0 // _BLOCK, (row0 + rows - 1) // _BLOCK + 1):
             for j in range(column0 // _BLOCK, (column0 + columns - 1) // _BLOCK + 1):
                 whole = Window(i * _BLOCK, (i + 1) * _BLOCK, j * _BLOCK, (j + 1) * _BLOCK)
-                part = Window(
-                    max(whole.row0, row0), min(whole.row1, row0 + rows),
-                    max(whole.column0, column0), min(whole.column1, column0 + columns),
-                )  # fmt: skip
-                inside = part.inside(Window(row0, row0 + rows, column0, column0 + columns))
-                result[inside.slices] = block(step, i, j)[part.inside(whole).slices]
+                part = whole.common(wanted)
+                result[part.inside(wanted).slices] = block(step, i, j)[part.inside(whole).slices]
         return result
 
     return from_blocks

@@ -119,6 +119,20 @@ def test_where_a_picture_has_no_data_there_is_no_disparity(pair, settings):
     assert (found.validity[50:190, 20:370] == 0).mean() > 0.98
 
 
+def test_the_amount_of_nothing_around_a_film_changes_no_bit(pair, settings):
+    found = []
+    for margin in (512, 640):  # whole pixels of the coarsest level
+        left, right = (np.pad(picture, margin) for picture in (pair.left, pair.right))
+        one = match(left, right, (0, 200), **settings)
+        inner = np.s_[margin:-margin, margin:-margin]
+        outer = one.validity.copy()
+        outer[inner] = Validity.NO_DATA_LEFT
+        assert (outer & Validity.NO_DATA_LEFT != 0).all()
+        found.append([values[inner] for values in (one.disparity, one.validity, one.confidence, one.similarity)])
+    for less, more in zip(*found, strict=True):
+        assert_array_equal(less, more)
+
+
 def test_a_scratch_over_water_is_not_matched_with_one_of_the_other_film(pair, settings):
     rng = np.random.default_rng(3)
     left, right = (np.rint(120 + rng.normal(0, 1, pair.left.shape)).astype(np.uint8) for _ in range(2))
