@@ -8,8 +8,8 @@ rule match_dense:
         reference_dem=with_start_interval(of_site("reference_dem")),
         unstable_terrain=with_start_interval(site_file("unstable_terrain")),
     output:
-        disparity=temp("results/pairs/{pair}/disparity/{scatteritem}.tif"),
-        validity=temp("results/pairs/{pair}/validity/{scatteritem}.tif"),
+        disparity=temp("results/pairs/{pair}/disparity/{scatteritem}.npy"),
+        validity=temp("results/pairs/{pair}/validity/{scatteritem}.npy"),
     log:
         "logs/match_dense/{pair}_{scatteritem}.log",
     benchmark:
@@ -35,10 +35,11 @@ rule match_dense:
 
 rule merge_disparity:
     input:
+        fore="results/pairs/{pair}/fore_epipolar.tif",
         disparity=gather.match_dense(
-            "results/pairs/{{pair}}/disparity/{scatteritem}.tif"
+            "results/pairs/{{pair}}/disparity/{scatteritem}.npy"
         ),
-        validity=gather.match_dense("results/pairs/{{pair}}/validity/{scatteritem}.tif"),
+        validity=gather.match_dense("results/pairs/{{pair}}/validity/{scatteritem}.npy"),
     output:
         disparity="results/pairs/{pair}/disparity.tif",
         validity="results/pairs/{pair}/validity.tif",

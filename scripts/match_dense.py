@@ -11,11 +11,10 @@ from cosp.dense.resampling import SmoothField, StartInterval, fill_holes
 from cosp.epipolar.rectification import Rectification
 from cosp.epipolar.start_interval import disparities_about
 from cosp.imaging.windows import Window, strip_of
-from cosp.io import heights, rasters, records, vectors
+from cosp.io import arrays, heights, rasters, records, vectors
 from cosp.io.logs import log_to
 
 SMOOTH_BAND = 2  # of y_parallax.tif
-VALIDITY_BANDS = ("validity", "confidence", "similarity")
 NODE_SPACING_PX = 64  # of the start interval
 FOOTPRINT_POINTS = 25  # a side
 
@@ -49,7 +48,6 @@ def match_dense(
     header = rasters.info(fore_path)
     rows, columns = header.shape
     first, last = strip_of(rows, strip)
-    wanted = Window(first, last, 0, columns)
     aligned = strip_alignment_px(disparity_range_px[1] - disparity_range_px[0])
     seen = Window(max(first - STRIP_HALO_PX, 0) // aligned * aligned, min(last + STRIP_HALO_PX, rows), 0, columns)
     aft_seen = Window(seen.row0, seen.row1, 0, rasters.info(aft_path).shape[1])
@@ -85,14 +83,9 @@ def match_dense(
         threads=threads,
     )
 
-    # Not compressed, as the strips are joined soon and then removed.
-    place = {"grid": header.grid.window(first, last, 0, columns), "crs": header.crs, "compressed": False}
-    rasters.write(disparity_path, found.disparity, **place, descriptions=("disparity",))
-    with rasters.create(
-        validity_path, shape=wanted.shape, dtype=np.uint8, **place, count=3, descriptions=VALIDITY_BANDS
-    ) as validity_file:
-        for band, values in enumerate((found.validity, found.confidence, found.similarity), start=1):
-            validity_file.write(None, values, band)
+    # Plain arrays, as the strips are joined soon and then removed.
+    arrays.write(disparity_path, [found.disparity])
+    arrays.write(validity_path, [found.validity, found.confidence, found.similarity])
 
 
 def smooth_y_parallax(y_parallax_path, fore_grid):

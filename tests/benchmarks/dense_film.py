@@ -72,8 +72,8 @@ if __name__ == "__main__":
             paths["aft"],
             chosen.pair / "y_parallax.tif",
             chosen.folder / "range.json",
-            chosen.folder / f"disparity_{strip}.tif",
-            chosen.folder / f"validity_{strip}.tif",
+            chosen.folder / "disparity" / f"{strip}.npy",
+            chosen.folder / "validity" / f"{strip}.npy",
             strip=f"{strip}-of-{chosen.strips}",
             **{**OURS, "threads": chosen.threads},
         )

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from cosp.dense.coarse_to_fine import match
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.windows import Window
-from cosp.io import rasters, records
+from cosp.io import arrays, rasters, records
 from tests.dense.synthetic import render, texture
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
@@ -46,20 +46,21 @@ def test_strips_join_to_what_the_whole_gives(folder, settings):
     folder, pair = folder
     strips = []
     for strip in ("1-of-2", "2-of-2"):
-        strips.append(folder / f"{strip}.tif")
+        strips.append(folder / "disparity" / f"{strip}.npy")
         function_of("match_dense")(
             folder / "fore.tif",
             folder / "aft.tif",
             folder / "y.tif",
             folder / "rectification.json",
             strips[-1],
-            folder / f"{strip}_validity.tif",
+            folder / "validity" / f"{strip}.npy",
             strip=strip,
             **settings,
         )
     function_of("merge_disparity")(
+        folder / "fore.tif",
         strips[::-1],
-        [folder / f"{path.stem}_validity.tif" for path in strips[::-1]],
+        [folder / "validity" / path.name for path in strips[::-1]],
         folder / "disparity.tif",
         folder / "validity.tif",
         folder / "disparity.json",
@@ -89,9 +90,10 @@ def test_strips_join_to_what_the_whole_gives(folder, settings):
 def test_joining_strips_of_a_long_film_takes_no_more_memory_than_a_few_of_their_rows(tmp_path):
     grid, rows = PixelGrid(0, 0, 1, 1, (16384, 1500)), np.arange(16384, dtype=np.float32)[:, None]
     disparity = np.broadcast_to(rows % 50, grid.shape).astype(np.float32)
-    rasters.write(tmp_path / "strip.tif", disparity, grid=grid, crs=rasters.PIXEL_CRS)
     validity = np.full((3, *grid.shape), 200, np.uint8)
-    rasters.write(tmp_path / "strip_validity.tif", validity, grid=grid, crs=rasters.PIXEL_CRS)
+    for name, bands in (("disparity", [disparity]), ("validity", validity)):
+        arrays.write(tmp_path / name / "1-of-1.npy", bands)
+    rasters.write(tmp_path / "fore.tif", validity[0], grid=grid, crs=rasters.PIXEL_CRS)
     whole = disparity.nbytes + validity.nbytes
     del disparity, validity
     merge = function_of("merge_disparity")
@@ -101,8 +103,8 @@ def test_joining_strips_of_a_long_film_takes_no_more_memory_than_a_few_of_their_
     )
     tracemalloc.start()
     merge(
-        [tmp_path / "strip.tif"],
-        [tmp_path / "strip_validity.tif"],
+        tmp_path / "fore.tif",
+        *([tmp_path / name / "1-of-1.npy"] for name in ("disparity", "validity")),
         *(tmp_path / name for name in ("disparity.tif", "validity.tif", "disparity.json", "disparity.png")),
         title="long",
     )
