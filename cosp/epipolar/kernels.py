@@ -1,11 +1,11 @@
-"""The compiled loops: polynomials and splines of many points, film points of the pixels of a rectified image."""
+"""The compiled loops: polynomials, splines, film points of a rectified image, windows of it and their correlation."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from cosp.arrays import FloatArray
+from cosp.arrays import ByteArray, Float32Array, FloatArray, IntArray
 
 
 @njit(nogil=True, cache=True)
@@ -195,3 +195,107 @@ def _spline_weights(t: float) -> tuple[float, float, float, float]:
     """Weights of the four coefficients about a place that lies a part t after the second of them."""
     s = 1.0 - t
     return s * s * s / 6.0, 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - s * s * (1.0 - 0.5 * s), t * t * t / 6.0
+
+
+@njit(nogil=True, cache=True)
+def cut(picture: ByteArray, row: IntArray, column: IntArray, windows: ByteArray) -> None:
+    """Copy windows with the given first rows and columns (N,), which lie in the picture, into (N, h, w)."""
+    height, width = windows.shape[1:]
+    for n in range(row.size):
+        for y in range(height):
+            windows[n, y] = picture[row[n] + y, column[n] : column[n] + width]
+
+
+@njit(nogil=True, cache=True)
+def within_windows(nodes: FloatArray, spacing: int, unknown: float, values: Float32Array) -> None:
+    """Fill windows, (N, h, w), with values bilinear between those of every `spacing`-th pixel of lines and columns.
+
+    nodes : (N, a, b), the first pixel and one beyond the last among them.
+    unknown : stands for NaN.
+    """
+    for n in range(len(values)):
+        for y in range(values.shape[1]):
+            i = y // spacing
+            t = (y - i * spacing) / spacing
+            for j in range((values.shape[2] - 1) // spacing + 1):
+                value = (1.0 - t) * nodes[n, i, j] + t * nodes[n, i + 1, j]
+                step = ((1.0 - t) * nodes[n, i, j + 1] + t * nodes[n, i + 1, j + 1] - value) / spacing
+                if np.isnan(value + step):
+                    value, step = unknown, 0.0
+                for x in range(j * spacing, min((j + 1) * spacing, values.shape[2])):
+                    values[n, y, x] = value + step * (x - j * spacing)
+
+
+# Sums may be taken in any order: they are of whole numbers that float32 holds exactly.
+@njit(nogil=True, cache=True, fastmath={"reassoc", "contract"})
+def correlate(templates: ByteArray, searches: ByteArray, flat: float, surfaces: Float32Array) -> None:
+    """Zero-mean normalised cross-correlation of each template at every place inside its search image.
+
+    The same as `cosp.imaging.correlation.ncc_surfaces` of one channel, from exact sums; for small windows several times
+    quicker than by transforms.
+
+    templates : (N, h, w)
+    searches : (N, H, W)
+    flat : a window whose variance is below this part of its mean square, or of the search image's variance, gives 0.
+    surfaces : (N, H - h + 1, W - w + 1)
+    """
+    height, width = templates.shape[1:]
+    pixels = height * width
+    template = np.empty((height, width), np.float32)
+    search = np.empty(searches.shape[1:], np.float32)
+    # Of the columns of the lines under the template.
+    sums = np.empty(searches.shape[2])
+    squares = np.empty(searches.shape[2])
+    for n in range(len(templates)):
+        template[:] = templates[n]
+        search[:] = searches[n]
+        t_sum, t_square = _sums_of(template)
+        t_energy = t_square - t_sum * t_sum / pixels
+        s_sum, s_square = _sums_of(search)
+        least = flat * (s_square - s_sum * s_sum / search.size) / search.size * pixels
+        sums[:] = 0.0
+        squares[:] = 0.0
+        for y in range(height - 1):
+            for x in range(search.shape[1]):
+                sums[x] += search[y, x]
+                squares[x] += search[y, x] * search[y, x]
+        for i in range(surfaces.shape[1]):
+            entering = search[i + height - 1]
+            for x in range(search.shape[1]):
+                sums[x] += entering[x]
+                squares[x] += entering[x] * entering[x]
+            s_sum = sums[: width - 1].sum()
+            s_square = squares[: width - 1].sum()
+            for j in range(surfaces.shape[2]):
+                s_sum += sums[j + width - 1]
+                s_square += squares[j + width - 1]
+                energy = s_square - s_sum * s_sum / pixels
+                surfaces[n, i, j] = 0.0
+                if energy > least and t_energy > flat * t_square:
+                    product = 0.0
+                    for y in range(height):
+                        a = template[y]
+                        b = search[i + y, j : j + width]
+                        line = np.float32(0.0)
+                        for x in range(width):
+                            line += a[x] * b[x]
+                        product += line
+                    value = (product - t_sum * s_sum / pixels) / np.sqrt(energy * t_energy)
+                    surfaces[n, i, j] = min(max(value, -1.0), 1.0)
+                s_sum -= sums[j]
+                s_square -= squares[j]
+            leaving = search[i]
+            for x in range(search.shape[1]):
+                sums[x] -= leaving[x]
+                squares[x] -= leaving[x] * leaving[x]
+
+
+@njit(nogil=True, cache=True)
+def _sums_of(picture: Float32Array) -> tuple[float, float]:
+    """Sum and sum of squares."""
+    total = 0.0
+    square = 0.0
+    for value in picture.ravel():
+        total += value
+        square += value * value
+    return total, square

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosp.arrays import FloatArray
+from cosp.epipolar import kernels
 from cosp.epipolar.correction import RowCorrection, correction_field
 from cosp.epipolar.patches import Patches
 from cosp.epipolar.rectification import Rectification
@@ -18,7 +19,7 @@ from cosp.epipolar.smoothing import local_median, smooth_field
 from cosp.errors import NotEnoughMatchesError
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.statistics import nmad
-from cosp.imaging.correlation import ncc_surfaces, subpixel_peaks
+from cosp.imaging.correlation import FLAT, subpixel_peaks
 
 _log = logging.getLogger(__name__)
 
@@ -150,10 +151,15 @@ def measure_y_parallax(
             )
         if factor == 1:
             break
-        disparity, y_parallax = (
-            np.where(np.isfinite(low), _filled(local_median(np.where(good, values, np.nan), radius)), np.nan)
-            for values, radius in ((measured.disparity_px, 1), (measured.y_parallax_px, _MEDIAN_RADIUS))
-        )
+        with ThreadPoolExecutor(min(threads, 2)) as pool:
+            disparity, y_parallax = (
+                np.where(np.isfinite(low), field, np.nan)
+                for field in pool.map(
+                    _filled_medians,
+                    [np.where(good, values, np.nan) for values in (measured.disparity_px, measured.y_parallax_px)],
+                    [1, _MEDIAN_RADIUS],
+                )
+            )
         factor //= 2
         search = (_ROW_SEARCH_PX, _COLUMN_SEARCH_PX)
     raw = np.where(good, measured.y_parallax_px, np.nan)
@@ -202,8 +208,9 @@ class _Measured:
     ratio: NDArray[np.float64]
 
 
-def _filled(values: FloatArray) -> NDArray[np.float64]:
-    """Values with their gaps filled by the smooth field through them."""
+def _filled_medians(measured: FloatArray, radius: int) -> NDArray[np.float64]:
+    """Medians of what was measured about each node, gaps filled by the smooth field through them."""
+    values = local_median(measured, radius)
     smooth = smooth_field(values, np.ones(values.shape), sigma_nodes=1.0)
     return np.where(np.isfinite(values), values, smooth)
 
@@ -264,7 +271,9 @@ def _correlate_strip(
     templates = fore(row[usable], column[usable], (template_px, template_px), factor)
     searches = aft(aft_row[usable], aft_column[usable], aft_shape, factor)
     lit = (templates == 0).mean(axis=(1, 2)) <= _MOST_BLACK
-    shift, score, ratio = subpixel_peaks(ncc_surfaces(templates[lit], searches[lit]))
+    surfaces = np.empty((int(lit.sum()), 2 * search[0] + 1, 2 * search[1] + 1), np.float32)
+    kernels.correlate(templates[lit], searches[lit], FLAT, surfaces)
+    shift, score, ratio = subpixel_peaks(surfaces)
     rows, columns = (index[lit] for index in np.nonzero(usable))
     result.y_parallax_px[rows, columns] = (shift[:, 0] + aside_row[rows, columns]) * factor
     result.disparity_px[rows, columns] = (shift[:, 1] + aside_column[rows, columns]) * factor

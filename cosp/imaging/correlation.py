@@ -15,7 +15,7 @@ _BATCH_PIXELS = 1 << 20
 # A rival peak counts only if it is more than this far from the highest one, in either direction.
 _PEAK_RADIUS_PX = 3
 # Windows whose variance is below this part of their mean square, or of the whole search image's, are flat.
-_FLAT = 1e-6
+FLAT = 1e-6
 
 
 def ncc_surfaces(templates: FloatArray, searches: FloatArray) -> Float32Array:
@@ -82,8 +82,8 @@ def _ncc_of_batch(templates: FloatArray, searches: FloatArray) -> Float32Array:
         search_energy -= np.square(sums, out=sums) / pixels
     template_energy = np.square(template, dtype=np.float64).sum(axis=(1, 2, 3))[:, None, None]
 
-    flat_search = _FLAT * squares.mean(axis=(1, 2), dtype=np.float64)[:, None, None] * pixels
-    flat_template = _FLAT * np.square(templates, dtype=np.float64).sum(axis=(1, 2, 3))[:, None, None]
+    flat_search = FLAT * squares.mean(axis=(1, 2), dtype=np.float64)[:, None, None] * pixels
+    flat_template = FLAT * np.square(templates, dtype=np.float64).sum(axis=(1, 2, 3))[:, None, None]
     textured = (search_energy > flat_search) & (template_energy > flat_template)
     norm = np.sqrt(np.where(textured, search_energy * template_energy, 1.0))
     return np.where(textured, np.clip(products / norm, -1.0, 1.0), 0.0).astype(np.float32)

@@ -7,12 +7,14 @@ import functools
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
+from cosp.epipolar import kernels
 from cosp.epipolar.parallax import measure_y_parallax, node_grid
 from cosp.epipolar.patches import Reduced, image_patches
 from cosp.epipolar.smoothing import local_median, smooth_field
 from cosp.errors import NotEnoughMatchesError
+from cosp.imaging.correlation import FLAT, ncc_surfaces
 from cosp.imaging.windows import Window
 
 SHAPE = (1100, 900)
@@ -177,3 +179,22 @@ def test_a_reduced_image_is_the_mean_of_blocks_and_is_read_once(rng):
     assert len(read) == len(set(read)) == 6
     assert_array_equal(reduced(Window(100, 130, 2290, 2310), 1)[:, :10], image[100:130, 2290:])
     assert not reduced(Window(5000, 5010, 0, 4), 2).any()
+
+
+def test_the_correlation_of_small_windows_is_that_by_transforms(rng):
+    searches = rng.integers(0, 256, (6, 20, 31)).astype(np.uint8)
+    templates = rng.integers(0, 256, (6, 14, 16)).astype(np.uint8)
+    templates[0] = searches[0, 4:18, 9:25]
+    templates[1] = 255 - searches[1, 2:16, 3:19]
+    templates[2] = 77
+    searches[3, :, :20] = 0
+    searches[4], searches[4, :, 12:] = 200, 201
+    searches[5] = 90
+    surfaces = np.full((6, 7, 16), np.nan, np.float32)
+    kernels.correlate(templates, searches, FLAT, surfaces)
+    assert_allclose(surfaces, ncc_surfaces(templates, searches), atol=1e-6)
+    assert_allclose([surfaces[0, 4, 9], surfaces[1, 2, 3]], [1.0, -1.0], atol=1e-6)
+    assert not surfaces[2].any()
+    assert not surfaces[3, :, :5].any()
+    assert surfaces[4].any()
+    assert not surfaces[5].any()
