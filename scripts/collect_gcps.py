@@ -44,6 +44,8 @@ def collect_gcps(
     gate_px,
     min_per_tile,
     trials,
+    relief_min_places,
+    relief_min_share,
     cell_mm,
     per_cell,
     max_slope_deg,
@@ -56,6 +58,7 @@ def collect_gcps(
     check_columns,
     check_rows,
     min_gcps,
+    relief_min_gcps,
     seed,
 ):
     camera = records.read(footprint_path, Footprint).camera
@@ -104,6 +107,9 @@ def collect_gcps(
             gate_px=gate_px,
             min_per_tile=min_per_tile,
             trials=trials,
+            relief=not reference_image_path,
+            relief_min_places=relief_min_places,
+            relief_min_share=relief_min_share,
             cell_mm=cell_mm,
             per_cell=per_cell,
             max_slope_deg=max_slope_deg,
@@ -113,7 +119,7 @@ def collect_gcps(
             dem_sigma_m=dem_sigma_m,
             check_columns=check_columns,
             check_rows=check_rows,
-            min_gcps=min_gcps,
+            min_gcps=min_gcps if reference_image_path else relief_min_gcps,
             rng=np.random.default_rng(seed),
         )
     except NotEnoughMatchesError as error:
@@ -153,6 +159,8 @@ if __name__ == "__main__":
             gate_px=snakemake.params.gate_px,
             min_per_tile=snakemake.params.min_per_tile,
             trials=snakemake.params.trials,
+            relief_min_places=snakemake.params.relief_min_places,
+            relief_min_share=snakemake.params.relief_min_share,
             cell_mm=snakemake.params.cell_mm,
             per_cell=snakemake.params.per_cell,
             max_slope_deg=snakemake.params.max_slope_deg,
@@ -165,5 +173,6 @@ if __name__ == "__main__":
             check_columns=snakemake.params.check_columns,
             check_rows=snakemake.params.check_rows,
             min_gcps=snakemake.params.min_gcps,
+            relief_min_gcps=snakemake.params.relief_min_gcps,
             seed=snakemake.params.seed,
         )

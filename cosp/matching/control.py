@@ -16,7 +16,7 @@ from cosp.errors import NotEnoughMatchesError
 from cosp.geometry.grids import PixelGrid
 from cosp.geometry.statistics import nmad, summarise
 from cosp.matching.film_image import FilmImage
-from cosp.matching.filtering import block_of, consistent_by_tile, in_check_blocks, thinned
+from cosp.matching.filtering import agreeing_with_neighbours, block_of, consistent_by_tile, in_check_blocks, thinned
 from cosp.matching.ground import Bounds, OnGrid, ground_pixel_m, grown
 from cosp.matching.masks import at_points, film_faults, gradient, still_water
 from cosp.matching.redundancy import sigma_factor
@@ -40,6 +40,8 @@ _FINEST_POSTING_M = 30.0
 _MOST_WATER = 0.2
 # So many points of the user's own carry a film without matches.
 _ENOUGH_OWN = 12
+# Templates of relief are large: so many of them away a match still counts for a neighbour.
+_REACH_TEMPLATES = 3.0
 # Steps of the derivatives of film points by the ground, m.
 _STEP_M = 1.0
 
@@ -59,6 +61,9 @@ def collect(
     gate_px: float,
     min_per_tile: int,
     trials: int,
+    relief: bool,
+    relief_min_places: int,
+    relief_min_share: float,
     cell_mm: float,
     per_cell: int,
     max_slope_deg: float,
@@ -101,6 +106,10 @@ def collect(
         sigma_ground_m, sigma_height_m; NaN of the last four means from the DEM and the values given here.
     tile_mm, gate_px, min_per_tile, trials
         See `consistent_by_tile`; the gate in pixels of the images that were matched.
+    relief : bool
+        Whether the matches are with shaded relief, so weak that they count by what their neighbours say.
+    relief_min_places, relief_min_share
+        See `agreeing_with_neighbours`.
     cell_mm, per_cell
         See `thinned`.
     max_slope_deg : float
@@ -182,10 +191,22 @@ def collect(
     agreeing = np.zeros(len(points), bool)
     if usable.any():
         gate_mm = gate_px * float(points["posting_m"].median()) * film.pixel_mm / pixel_m
+        template_mm = float((points["template_px"] * points["posting_m"]).median()) * film.pixel_mm / pixel_m
         predicted = np.where(usable[:, None], camera.project(ground), np.nan)
-        agreeing = consistent_by_tile(
-            predicted, film_mm, tile_mm=tile_mm, gate_mm=gate_mm, minimum=min_per_tile, trials=trials, rng=rng
-        )
+        if relief:
+            agreeing = agreeing_with_neighbours(
+                predicted,
+                film_mm,
+                template_mm=template_mm,
+                reach_mm=max(tile_mm / 2, _REACH_TEMPLATES * template_mm),
+                gate_mm=gate_mm,
+                min_places=relief_min_places,
+                min_share=relief_min_share,
+            )
+        else:
+            agreeing = consistent_by_tile(
+                predicted, film_mm, tile_mm=tile_mm, gate_mm=gate_mm, minimum=min_per_tile, trials=trials, rng=rng
+            )
     score = points["score"].to_numpy(float)
     kept = np.zeros(len(points), bool)
     chosen = np.flatnonzero(agreeing)
@@ -215,7 +236,6 @@ def collect(
     # What a matcher states of itself is a guess that errs on the safe side; the matches tell.
     factor = None
     if agreeing.any():
-        template_mm = float((points["template_px"] * points["posting_m"]).median()) * film.pixel_mm / pixel_m
         factor = sigma_factor(film_mm[agreeing], residual[agreeing], sigma_px[agreeing] * film.pixel_mm, template_mm)
     if factor is not None:
         sigma_px = np.where(mine, sigma_px, factor * sigma_px)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cosp.arrays import BoolArray, FloatArray, IntArray
 from cosp.geometry.transforms import estimate_affine, ransac
@@ -60,6 +61,64 @@ def consistent_by_tile(
         if agreeing.sum() >= minimum:
             keep[chosen[agreeing]] = True
     return keep
+
+
+def agreeing_with_neighbours(
+    predicted_mm: FloatArray,
+    measured_mm: FloatArray,
+    *,
+    template_mm: float,
+    reach_mm: float,
+    gate_mm: float,
+    min_places: int,
+    min_share: float,
+) -> BoolArray:
+    """Matches whose shift against the prediction is that of most matches about them.
+
+    For matches so weak that many are wrong, and that come of templates which share most of their pixels: what a
+    template got wrong its nearest neighbours got wrong alike, so that these are not asked. A shift has no freedom to
+    fit chance, as an affine of a few templates has; between neighbours the error of a placed camera changes by less
+    than the gate.
+
+    Parameters
+    ----------
+    predicted_mm, measured_mm : (N, 2) arrays
+        Film points of the ground by the camera, and where they were matched. NaN never agrees.
+    template_mm : float
+        Side of a template: matches nearer to one another, along and across, are one piece of evidence.
+    reach_mm : float
+        How far neighbours lie.
+    gate_mm : float
+        Largest difference of two shifts that agree.
+    min_places : int
+        Pieces of evidence besides its own that must agree with a match.
+    min_share : float
+        Least share of the neighbours that must agree.
+
+    Returns
+    -------
+    (N,) bool array
+    """
+    keep = np.zeros(len(measured_mm), bool)
+    seen = np.flatnonzero(np.isfinite(np.concatenate([predicted_mm, measured_mm], axis=1)).all(axis=1))
+    if not len(seen):
+        return keep
+    place, shift = measured_mm[seen], measured_mm[seen] - predicted_mm[seen]
+    for index, near in enumerate(cKDTree(place).query_ball_point(place, reach_mm, return_sorted=True)):
+        others = np.array(near)[np.abs(place[near] - place[index]).max(axis=1) >= template_mm]
+        agreeing = others[np.linalg.norm(shift[others] - shift[index], axis=1) <= gate_mm]
+        if len(agreeing) and len(agreeing) >= min_share * len(others):
+            keep[seen[index]] = _has_apart(place[agreeing], template_mm, min_places)
+    return keep
+
+
+def _has_apart(points: FloatArray, apart: float, count: int) -> bool:
+    """Whether so many points can be taken in turn no two of which are nearer to each other along and across."""
+    for _ in range(count):
+        if not len(points):
+            return False
+        points = points[np.abs(points - points[0]).max(axis=1) >= apart]
+    return True
 
 
 def thinned(film_mm: FloatArray, score: FloatArray, *, cell_mm: float, per_cell: int) -> BoolArray:

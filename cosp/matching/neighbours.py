@@ -18,6 +18,7 @@ from cosp.geometry.frames import LocalFrame
 from cosp.matching.footprint import Footprint
 from cosp.matching.ground import ground_pixel_m
 from cosp.matching.placement import corners_lonlat, shift_m, turned_about_centre
+from cosp.matching.relief import Sun
 
 # What 0.3 degrees of attitude move the middle of a frame.
 _ATTITUDE_SIGMA_M = 1000.0
@@ -62,6 +63,8 @@ class Expected:
         Of its place on the ground, per coordinate.
     turned, mirrored : bool
         How the films of the same camera were digitised.
+    sun : Sun
+        Of a frame of the pass: they are exposed within minutes.
     neighbours : tuple of str
     """
 
@@ -69,6 +72,7 @@ class Expected:
     sigma_m: float
     turned: bool
     mirrored: bool
+    sun: Sun
     neighbours: tuple[str, ...]
 
     def footprint(self, predicted: PanoramicCamera, height_m: float) -> Footprint:
@@ -88,7 +92,8 @@ class Expected:
             sigma_m=self.sigma_m,
             posting_m=float("nan"),
             reference="neighbours",
-            sun_azimuth_deg=180.0,
+            sun_azimuth_deg=self.sun.azimuth_deg,
+            sun_elevation_deg=self.sun.elevation_deg,
             corners_lonlat=corners_lonlat(self.camera, height_m),
             blocks=(),
             neighbours=self.neighbours,
@@ -140,12 +145,14 @@ def expected_frame(predicted: PanoramicCamera, frame: int, look: str, placed: Se
         half_length_mm=predicted.half_length_mm,
         half_width_mm=predicted.half_width_mm,
     )
-    like = used[0].footprint if alike else None
+    nearest = used[0].footprint
+    like = nearest if alike else None
     return Expected(
         camera,
         sigma,
         turned=like is not None and like.turned,
         mirrored=like is not None and like.mirrored,
+        sun=Sun(nearest.sun_azimuth_deg, nearest.sun_elevation_deg),
         neighbours=tuple(p.footprint.scene for p in used),
     )
 

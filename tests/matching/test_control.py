@@ -71,7 +71,8 @@ def own_points(film_mm, lonlath, **more):
 def gathered(matches, camera, **changes):
     settings = dict(
         heights_on=ridges, unstable_on=None, crs=CRS, dem_posting_m=POSTING, reference_shift_m=(0.0, 0.0), own=None,
-        tile_mm=40, gate_px=3, min_per_tile=8, trials=100, cell_mm=8, per_cell=2, max_slope_deg=40, white=252,
+        tile_mm=40, gate_px=3, min_per_tile=8, trials=100, relief=False, relief_min_places=4, relief_min_share=0.5,
+        cell_mm=8, per_cell=2, max_slope_deg=40, white=252,
         scratch_grey=60, reference_sigma_m=3.0, dem_sigma_m=4.0, check_columns=10, check_rows=2, min_gcps=50,
         rng=np.random.default_rng(1),
     )  # fmt: skip

@@ -1,6 +1,6 @@
 import numpy as np
 
-from cosp.matching.filtering import consistent_by_tile, in_check_blocks, thinned
+from cosp.matching.filtering import agreeing_with_neighbours, consistent_by_tile, in_check_blocks, thinned
 
 HALF_LENGTH_MM, HALF_WIDTH_MM = 357.4, 27.7
 
@@ -40,6 +40,60 @@ def test_points_the_camera_does_not_see_never_agree():
     keep = consistent(predicted, measured, rng)
     assert not keep[::7].any()
     assert keep.sum() > 1000
+
+
+TEMPLATE_MM = 10.0
+
+
+def templates(rng, *, right):
+    """Film points of templates in fours, half a template apart, and shifts of which those of a wrong four are alike."""
+    middle = points(rng, 400)
+    film_mm = (middle[:, None] + TEMPLATE_MM / 4 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])).reshape(-1, 2)
+    # A placed camera that is off by more than the gate, and otherwise at the other end of the film.
+    bent = np.column_stack([0.6 + 0.3 * film_mm[:, 0] / HALF_LENGTH_MM, -0.2 - (film_mm[:, 0] / 500) ** 2])
+    wrong = np.repeat(rng.random(len(middle)) >= right, 4)
+    chance = np.repeat(rng.uniform(-1.4, 1.4, middle.shape), 4, axis=0)
+    shift = np.where(wrong[:, None], chance, bent) + 0.03 * rng.standard_normal(film_mm.shape)
+    return film_mm, shift, wrong, np.linalg.norm(shift - bent, axis=1)
+
+
+def neighbourly(film_mm, shift, **changes):
+    chosen = dict(template_mm=TEMPLATE_MM, reach_mm=30.0, gate_mm=0.3, min_places=4, min_share=0.5)
+    return agreeing_with_neighbours(film_mm - shift, film_mm, **{**chosen, **changes})
+
+
+def test_weak_matches_are_kept_where_most_of_their_neighbours_say_the_same():
+    film_mm, shift, wrong, error_mm = templates(np.random.default_rng(6), right=0.7)
+    keep = neighbourly(film_mm, shift)
+    assert keep[~wrong].mean() > 0.9
+    assert error_mm[keep].max() < 0.5  # the gate, and what right ones differ by
+    assert (keep & (error_mm > 0.3)).sum() < 0.02 * keep.sum()
+
+
+def test_where_the_film_shows_nothing_no_match_is_kept_though_those_of_a_template_err_alike():
+    for seed in range(5):
+        film_mm, shift, *_ = templates(np.random.default_rng(seed), right=0.0)
+        assert not neighbourly(film_mm, shift).any()
+        # Were they asked, those nearest would vouch for it.
+        assert neighbourly(film_mm, shift, template_mm=1.0, min_share=0.05).mean() > 0.3
+
+
+def test_among_a_majority_of_wrong_matches_few_are_kept_and_these_are_right():
+    for seed in range(7, 10):
+        film_mm, shift, _, error_mm = templates(np.random.default_rng(seed), right=0.3)
+        keep = neighbourly(film_mm, shift)
+        assert 0.0 < keep.mean() < 0.1
+        assert error_mm[keep].max() < 0.5
+
+
+def test_a_match_without_enough_neighbours_apart_is_not_kept():
+    film_mm = np.array([[0.0, 0.0], [12.0, 0.0], [0.0, 12.0], [12.0, 12.0], [24.0, 0.0]])
+    shift = np.full(film_mm.shape, 0.3)
+    assert neighbourly(film_mm, shift).all()
+    assert not neighbourly(film_mm[:4], shift[:4]).any()
+    assert neighbourly(film_mm[:4], shift[:4], min_places=3).all()
+    shift[0] = np.nan
+    assert not neighbourly(film_mm, shift).any()
 
 
 def test_thinning_keeps_the_best_of_each_cell():

@@ -68,6 +68,7 @@ def test_films_of_one_camera_lie_alike_and_a_frame_known_by_them_alone_says_so()
     assert footprint.reference == "neighbours"
     assert footprint.agreeing_share == 0.0
     assert footprint.sigma_m == expected.sigma_m
+    assert (footprint.sun_azimuth_deg, footprint.sun_elevation_deg) == (135.0, 35.0)
     assert abs(footprint.shift_east_m + 60e3) < 3000.0
     assert abs(footprint.shift_north_m - 30e3) < 3000.0
 

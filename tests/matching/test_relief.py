@@ -63,9 +63,10 @@ def test_control_from_relief_lies_within_half_a_posting_and_says_so_though_the_f
     collect_gcps(
         [tmp_path / "matches.parquet"], tmp_path / "film.tif", tmp_path / "footprint.json", tmp_path / "dem.tif", None,
         None, None, tmp_path / "gcps.parquet", tmp_path / "gcps.json", reference_dem_heights="ellipsoidal", tile_mm=40,
-        gate_px=3, min_per_tile=8, trials=200, cell_mm=8, per_cell=2, max_slope_deg=60, white=252, scratch_grey=20,
-        reference_sigma_m=3, dem_sigma_m=4.0, shift_search_m=300, correct_reference_shift=False, check_columns=10,
-        check_rows=2, min_gcps=50, seed=1,
+        gate_px=3, min_per_tile=8, trials=200, relief_min_places=4, relief_min_share=0.5, cell_mm=8,
+        per_cell=2, max_slope_deg=60, white=252, scratch_grey=20, reference_sigma_m=3, dem_sigma_m=4.0,
+        shift_search_m=300, correct_reference_shift=False, check_columns=10, check_rows=2, min_gcps=1000,
+        relief_min_gcps=50, seed=1,
     )  # fmt: skip
     gcps = tables.read(tmp_path / "gcps.parquet")
     kept = gcps[gcps["role"] != "rejected"]

@@ -17,6 +17,7 @@ from .conftest import make_camera
 COLLECTING = [
     *("tile_mm", "gate_px", "min_per_tile", "trials", "cell_mm", "per_cell", "max_slope_deg", "white"),
     *("scratch_grey", "reference_sigma_m", "dem_sigma_m", "check_columns", "check_rows", "min_gcps"),
+    *("relief_min_places", "relief_min_share", "relief_min_gcps"),
 ]
 MATCHING = [
     *("template_px", "search_px", "min_score", "max_ratio", "max_return_px", "candidates", "gate_px", "tile_mm"),
