@@ -10,7 +10,7 @@ from cosp.imaging.windows import tiles, worked_on
 from cosp.io import rasters, records
 from cosp.io.logs import log_to
 
-TILE = 1024
+TILE = 2048
 
 
 def resample_epipolar(

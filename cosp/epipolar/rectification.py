@@ -19,7 +19,6 @@ from cosp.epipolar.directions import common_directions_rad
 from cosp.epipolar.polynomials import Basis, Fit, evaluate, fit, fit_quality, fit_row_functions
 from cosp.errors import NoOverlapError
 from cosp.geometry.grids import PixelGrid
-from cosp.geometry.lattices import between_nodes
 from cosp.geometry.robust import tukey_weights
 from cosp.imaging.windows import Window
 
@@ -35,8 +34,7 @@ _ROBUST_STEPS = 6
 # Pixels from one place of the image to the next whose film point is worked out for a picture; straight lines between
 # them are within 1e-3 px.
 _NODE_PX = 8
-_PER_PIXEL = (1 / _NODE_PX, 1 / _NODE_PX)
-_FAR_PX = -6e7  # stands for "nowhere": still far away when mixed with a 64th, still in range for OpenCV
+_FAR_PX = -1e6  # stands for "nowhere"
 # Nodes a side at which the extent of a window on the film is looked up.
 _LATTICE = 33
 # Terms of disparity at a given height as a function of the place on the fore film.
@@ -166,11 +164,10 @@ class EpipolarMap:
         rows = np.arange(row0, window.row1 + _NODE_PX, _NODE_PX, dtype=float)[:, None]
         columns = np.arange(column0, window.column1 + _NODE_PX, _NODE_PX, dtype=float)[None, :]
         nodes = film_grid.pixels(self.film(rows, columns))
-        first = ((window.row0 - row0) / _NODE_PX, (window.column0 - column0) / _NODE_PX)
-        film_rows, film_columns = (
-            between_nodes(np.where(np.isfinite(node), node - start, _FAR_PX), first, _PER_PIXEL, window.shape)
-            for node, start in zip(nodes, corner, strict=True)
-        )
+        places = np.empty((2, 1, window.row1 - row0, window.column1 - column0), np.float32)
+        for node, start, place in zip(nodes, corner, places, strict=True):
+            kernels.within_windows((node - start)[None], _NODE_PX, _FAR_PX, place)
+        film_rows, film_columns = places[:, 0, window.row0 - row0 :, window.column0 - column0 :]
         return film_rows, film_columns
 
     def _uncorrected_rows(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
