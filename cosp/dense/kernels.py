@@ -156,8 +156,13 @@ def _turned(builder: Any, vector: Any, width: int, places: int) -> Any:
     return builder.call(turn, [whole, whole, words.constant(places)])
 
 
-def _emit_paths(builder: Any, count: int, paths: Sequence[Any], costs: Any, small: Any, large: Any) -> list[Any]:
-    """Carry four paths over one pixel; `costs` and paths lie in vectors of _REGISTER bytes."""
+def _emit_paths(
+    builder: Any, count: int, paths: Sequence[Any], costs: Any, small: Any, large: Any, above: Any
+) -> list[Any]:
+    """Carry four paths over one pixel; `costs` and paths lie in vectors of _REGISTER bytes.
+
+    above : what the last vector is to be taken down by, so that the least of each of its paths is 0
+    """
     lanes = _Lanes(builder, _REGISTER, 8)
     places = range(_REGISTER)
     carried = []
@@ -165,9 +170,11 @@ def _emit_paths(builder: Any, count: int, paths: Sequence[Any], costs: Any, smal
         # At either end of the range a disparity is its own neighbour, a step from which never pays.
         lower = _permuted(builder, path, path, [i if i % count == 0 else i - 1 for i in places])
         upper = _permuted(builder, path, path, [i if i % count == count - 1 else i + 1 for i in places])
-        beside = lanes.lesser(lower, upper)
-        stepped = lanes.saturating_sum(beside, lanes.splat(small))
-        carried.append(builder.add(lanes.lesser(lanes.lesser(path, lanes.splat(large)), stepped), costs))
+        stepped = builder.add(lanes.lesser(lower, upper), lanes.splat(small))  # at most 127 + 65
+        reached = lanes.lesser(path, stepped)
+        if path is paths[-1]:
+            reached = builder.sub(reached, above)
+        carried.append(builder.add(lanes.lesser(reached, lanes.splat(large)), costs))
     return carried
 
 
@@ -185,7 +192,10 @@ def _emit_row(
     vectors = 4 * count // _REGISTER
     step = 1 if down else -1
     waiting = cgutils.alloca_once_value(builder, lanes.constant(0))  # goes into the next slot once that is read
-    beside = cgutils.alloca_once_value(builder, lanes.constant(0))  # the last vector of the pixel before
+    # The last vector of the pixel before, and by how much its path beside lies above 0. It is taken down late, when the
+    # least of it is known: nothing else waits for what is found out from pixel to pixel.
+    beside = cgutils.alloca_once_value(builder, lanes.constant(0))
+    above = cgutils.alloca_once_value(builder, lanes.constant(0))
     with cgutils.for_range(builder, columns) as loop:
         column = loop.index if down else builder.sub(builder.sub(columns, _I64(1)), loop.index)
         slot = builder.add(states, builder.mul(builder.add(column, _I64(1)), _I64(4 * count)))
@@ -197,7 +207,7 @@ def _emit_row(
             third = _permuted(builder, third, third, range(_REGISTER))
             paths.append(_permuted(builder, third, builder.load(beside), [*range(half), *range(3 * half, 4 * half)]))
         costs, finish = pixel(column)
-        carried = _emit_paths(builder, count, paths, costs, small, large)
+        carried = _emit_paths(builder, count, paths, costs, small, large, builder.load(above))
         least, spread = _emit_least(builder, count, carried)
         normalised = [builder.sub(a, b) for a, b in zip(carried, spread, strict=True)]
         one = _Lanes(builder, count, 8)
@@ -211,7 +221,9 @@ def _emit_row(
         builder.store(normalised[0], waiting)
         one.store(path(normalised, 1), builder.add(slot, _I64(count)))
         one.store(path(normalised, 2), builder.add(slot, _I64(2 * count - step * 4 * count)))
-        builder.store(normalised[-1], beside)
+        builder.store(carried[-1], beside)
+        mine = range(_REGISTER, 2 * _REGISTER) if count == _REGISTER else [*range(half), *range(3 * half, 4 * half)]
+        builder.store(_permuted(builder, lanes.constant(0), spread[-1], mine), above)
         finish(carried, normalised, least)
 
 

@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 
+_LINE = 64  # bytes of a line of the cache: what crosses from one to the next takes twice as long to store
+
+
 class Workspace:
     """Arrays by name, not filled, that keep their memory; what one holds is lost when it is asked for again."""
 
@@ -21,7 +24,8 @@ class Workspace:
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         if name not in self._pieces or self._pieces[name].size < size:
             self._pieces.pop(name, None)  # before the next is asked for
-            self._pieces[name] = np.empty(size, np.uint8)
+            whole = np.empty(size + _LINE, np.uint8)
+            self._pieces[name] = whole[-whole.ctypes.data % _LINE :]
         return self._pieces[name][:size].view(dtype).reshape(shape)
 
 
