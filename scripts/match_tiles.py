@@ -50,8 +50,18 @@ def match_tiles(
     else:
         reference_on = relief_reference(heights_on, footprint.sun_azimuth_deg, footprint.sun_elevation_deg)
         reference_posting_m = references.posting_m(reference_dem_path)
-        template_px, min_score, max_ratio = relief_template_px, relief_min_score, relief_max_ratio
     film = FilmImage(rasters.info(film_path).grid, lambda window: rasters.read(film_path, window=window))
+    placed = PlacedFilm.of(
+        film,
+        camera,
+        reference_on=reference_on,
+        heights_on=heights_on,
+        crs=crs,
+        reference_posting_m=reference_posting_m,
+    )
+    if not reference_image_path:
+        template_px = placed.template_within_px(relief_template_px)
+        min_score, max_ratio = relief_min_score, relief_max_ratio
     chosen = matcher_by_name(
         matcher,
         template_px=template_px,
@@ -62,14 +72,6 @@ def match_tiles(
         features=features,
         max_features=max_features,
         superglue_weights=superglue_weights,
-    )
-    placed = PlacedFilm.of(
-        film,
-        camera,
-        reference_on=reference_on,
-        heights_on=heights_on,
-        crs=crs,
-        reference_posting_m=reference_posting_m,
     )
     if matcher in LEARNED:
         tile_px = (tile_height_px, tile_width_px)

@@ -36,6 +36,8 @@ _HEIGHT_RANGE_M = (0.0, 6000.0)
 _TERRAIN_POSTING_M = 200.0
 # Candidates along either side of a map tile.
 _TILE_SIDE = 2
+# So many templates at least side by side across the film.
+_WIDTH_TEMPLATES = 3
 # Largest side of a grid that counts as a tile: film coordinates are then smooth to far below a pixel.
 _TILE_M = 20_000.0
 
@@ -384,6 +386,10 @@ class PlacedFilm:
     def on_film_mm(self, count_px: float) -> float:
         """Length on the film of so many pixels of what is matched."""
         return count_px * self.posting_m / self.pixel_m * self.film.pixel_mm
+
+    def template_within_px(self, template_px: int) -> int:
+        """The side of a template, or what a third of the film's width is long: control ends half a template within."""
+        return min(template_px, int(2 * self.camera.half_width_mm / _WIDTH_TEMPLATES / self.on_film_mm(1.0)))
 
     def match(
         self,

@@ -122,6 +122,18 @@ def test_control_matches_lie_where_the_true_camera_shows_them(world, camera):
     assert np.ptp(matches.film_mm[:, 0]) > 1.6 * camera.half_length_mm
 
 
+@pytest.mark.parametrize(("posting_m", "expected_mm"), [(60.0, 25 * 0.28), (270.0, 2 * 27.7 / 3)])
+def test_templates_leave_room_for_three_across_the_film(world, camera, posting_m, expected_mm):
+    placed = PlacedFilm.of(
+        world.expose(camera, pixel_mm=0.28), camera, reference_on=world.on(world.image),
+        heights_on=world.on(world.heights), crs=CRS, reference_posting_m=posting_m,
+    )  # fmt: skip
+    template_px = placed.template_within_px(25)
+    assert template_px <= 25
+    assert placed.on_film_mm(template_px) == pytest.approx(expected_mm, abs=placed.on_film_mm(1.0))
+    assert placed.on_film_mm(template_px) <= 2 * camera.half_width_mm / 3
+
+
 @pytest.mark.slow
 def test_tie_points_are_the_same_ground_in_both_films(world):
     cameras = [make_camera(look) for look in ("fore", "aft")]
