@@ -242,7 +242,7 @@ def correlate(templates: ByteArray, searches: ByteArray, flat: float, surfaces: 
     height, width = templates.shape[1:]
     pixels = height * width
     template = np.empty((height, width), np.float32)
-    search = np.empty(searches.shape[1:], np.float32)
+    search = np.empty((searches.shape[1], searches.shape[2]), np.float32)
     # Of the columns of the lines under the template.
     sums = np.empty(searches.shape[2])
     squares = np.empty(searches.shape[2])
@@ -279,7 +279,7 @@ def correlate(templates: ByteArray, searches: ByteArray, flat: float, surfaces: 
                         line = np.float32(0.0)
                         for x in range(width):
                             line += a[x] * b[x]
-                        product += line
+                        product += float(line)
                     value = (product - t_sum * s_sum / pixels) / np.sqrt(energy * t_energy)
                     surfaces[n, i, j] = min(max(value, -1.0), 1.0)
                 s_sum -= sums[j]
@@ -296,6 +296,6 @@ def _sums_of(picture: Float32Array) -> tuple[float, float]:
     total = 0.0
     square = 0.0
     for value in picture.ravel():
-        total += value
-        square += value * value
+        total += float(value)
+        square += float(value * value)
     return total, square

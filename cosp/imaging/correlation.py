@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import fft
 
 from cosp.arrays import Float32Array, FloatArray
+from cosp.imaging import kernels
 
 # Transforms are taken of so many pixels at a time: enough to keep the FFT busy, few enough to stay in the cache.
 _BATCH_PIXELS = 1 << 20
@@ -61,44 +61,32 @@ def ncc_surfaces(templates: FloatArray, searches: FloatArray) -> Float32Array:
 def _ncc_of_batch(templates: FloatArray, searches: FloatArray) -> Float32Array:
     """Correlation surfaces of a few (N, C, h, w) templates in (N, C, H, W) search images."""
     pixels = templates.shape[2] * templates.shape[3]
-    template = templates.astype(np.float32)
-    template = template - template.mean(axis=(2, 3), keepdims=True)
+    template = np.subtract(templates, templates.mean(axis=(2, 3), keepdims=True), dtype=np.float32)
     # Without the mean of the whole search image nothing changes but the rounding of the sums.
-    search = searches.astype(np.float32)
-    search = search - search.mean(axis=(2, 3), keepdims=True)
+    search = np.subtract(searches, searches.mean(axis=(2, 3), keepdims=True), dtype=np.float32)
 
     # The valid lags never wrap, so a circular correlation of the size of the search image is enough.
     rows = searches.shape[2] - templates.shape[2] + 1
     columns = searches.shape[3] - templates.shape[3] + 1
     size = (fft.next_fast_len(searches.shape[2], real=True), fft.next_fast_len(searches.shape[3], real=True))
-    spectrum = np.conj(fft.rfft2(template, s=size)) * fft.rfft2(search, s=size)
+    spectrum = fft.rfft2(template, s=size)
+    np.conj(spectrum, out=spectrum)
+    spectrum *= fft.rfft2(search, s=size)
     products = fft.irfft2(spectrum.sum(axis=1), s=size)[:, :rows, :columns]
 
-    # One sum of squares does for all channels; the means are each channel's own.
-    squares = np.einsum("nchw,nchw->nhw", search, search)
-    search_energy = _box_sums(squares, templates.shape[2:])
-    for channel in range(search.shape[1]):
-        sums = _box_sums(search[:, channel], templates.shape[2:])
-        search_energy -= np.square(sums, out=sums) / pixels
-    template_energy = np.square(template, dtype=np.float64).sum(axis=(1, 2, 3))[:, None, None]
-
-    flat_search = FLAT * squares.mean(axis=(1, 2), dtype=np.float64)[:, None, None] * pixels
-    flat_template = FLAT * np.square(templates, dtype=np.float64).sum(axis=(1, 2, 3))[:, None, None]
+    search_energy, template_energy = np.empty((len(search), rows, columns)), np.empty((len(search), 1, 1))
+    kernels.box_energy(search, search_energy)
+    kernels.box_energy(template, template_energy)
+    flat_search = FLAT * _squares(search) * (pixels / (search.shape[2] * search.shape[3]))
+    flat_template = FLAT * _squares(np.asarray(templates, np.float32))
     textured = (search_energy > flat_search) & (template_energy > flat_template)
     norm = np.sqrt(np.where(textured, search_energy * template_energy, 1.0))
     return np.where(textured, np.clip(products / norm, -1.0, 1.0), 0.0).astype(np.float32)
 
 
-def _box_sums(images: FloatArray, box: tuple[int, ...]) -> NDArray[np.float64]:
-    """Sum of the pixels under a box at every place where it fits, (N, rows, columns), from the integral image."""
-    height, width = box
-    sums = np.empty((len(images), images.shape[1] - height + 1, images.shape[2] - width + 1))
-    for image, result in zip(images, sums, strict=True):
-        integral = cv2.integral(image, sdepth=cv2.CV_64F)
-        np.subtract(integral[height:, width:], integral[:-height, width:], out=result)
-        result -= integral[height:, :-width]
-        result += integral[:-height, :-width]
-    return sums
+def _squares(images: Float32Array) -> Float32Array:
+    """Sums of the squares of each (C, H, W) image, (N, 1, 1)."""
+    return np.asarray([np.vdot(image, image) for image in images], np.float32)[:, None, None]
 
 
 def subpixel_peaks(surfaces: FloatArray) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
