@@ -23,6 +23,8 @@ PART_LETTERS = ("a", "b", "c", "d")
 
 # Strips of a scattered rule are at most this large, so that a kill loses minutes.
 LARGEST_STRIP_MPX = 100.0
+# Of control, which looks at few of the pixels: less would be spent on starting jobs.
+LARGEST_CONTROL_STRIP_MPX = 400.0
 
 
 # Digest -------------------------------------------------------------------------------------------------------------
@@ -108,12 +110,12 @@ def runtime_min(mpx: float, *, us_per_px: float, threads: int = 1) -> int:
     return max(10, math.ceil(4.0 * mpx * us_per_px / 60.0 / max(threads, 1)))
 
 
-def strip_count(project: Project) -> int:
-    """Pieces that scattered rules cut a film into: as the config says, or by the largest film."""
+def strip_count(project: Project, largest_mpx: float = LARGEST_STRIP_MPX) -> int:
+    """Pieces that a scattered rule cuts a film into: as the config says, or none larger than so much of the film."""
     wanted = project.settings["strips"]
     if wanted != "auto":
         return int(wanted)
-    return max((math.ceil(film_mpx(scene) / LARGEST_STRIP_MPX) for scene in project.scenes.values()), default=1)
+    return max((math.ceil(film_mpx(scene) / largest_mpx) for scene in project.scenes.values()), default=1)
 
 
 # Files --------------------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ wildcard_constraints:
 
 
 scattergather:
-    match_tiles=house.strip_count(project),
+    match_tiles=house.strip_count(project, house.LARGEST_CONTROL_STRIP_MPX),
     match_dense=house.strip_count(project),
 
 

@@ -88,7 +88,7 @@ rule match_tiles:
     threads: 1
     resources:
         mem_mb=(
-            memory(0.5)
+            memory(1)
             if choices("match_tiles")["matcher"] in ("structural", "sift")
             else 4000
         ),

@@ -103,8 +103,14 @@ def test_a_film_is_cut_into_strips_of_at_most_100_million_pixels(pixel_um: float
     assert workflow.strip_count(_project(_scene(pixel_um))) == strips
 
 
+@pytest.mark.parametrize(("pixel_um", "strips"), [(7.0, 3), (14.0, 1)])
+def test_control_takes_larger_strips(pixel_um: float, strips: int) -> None:
+    assert workflow.strip_count(_project(_scene(pixel_um)), workflow.LARGEST_CONTROL_STRIP_MPX) == strips
+
+
 def test_a_chosen_number_of_strips_is_taken() -> None:
-    assert workflow.strip_count(_project(_scene(), strips=16)) == 16
+    project = _project(_scene(), strips=16)
+    assert workflow.strip_count(project) == workflow.strip_count(project, workflow.LARGEST_CONTROL_STRIP_MPX) == 16
 
 
 def test_memory_and_time_grow_with_the_film_and_never_vanish() -> None:

@@ -77,8 +77,8 @@ def test_twelve_pairs_are_planned_in_seconds(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     jobs = _jobs(done.stdout + done.stderr)
     assert (jobs["stitch"], jobs["match_pair"], jobs["adjust_bundle"], jobs["mosaic_site"]) == (24, 12, 1, 1)
-    # Full films are cut into 11 strips each: 24 films for control, 12 pairs for disparity.
-    assert (jobs["match_tiles"], jobs["match_dense"]) == (24 * 11, 12 * 11)
+    # Full films are cut into 3 strips each for control, of 24 films, and 11 for disparity, of 12 pairs.
+    assert (jobs["match_tiles"], jobs["match_dense"]) == (24 * 3, 12 * 11)
     assert "simulate_site" not in jobs
     assert seconds < 60.0, "four seconds on a quiet machine"
 
