@@ -1,17 +1,14 @@
 """Match one strip of an epipolar pair densely: disparity, validity, confidence and similarity of its rows."""
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from pyproj import Transformer
 
-from cosp.camera.panoramic import PanoramicCamera
 from cosp.dense.coarse_to_fine import STRIP_HALO_PX, match, strip_alignment_px
 from cosp.dense.resampling import SmoothField, StartInterval, fill_holes
-from cosp.epipolar.rectification import Rectification
-from cosp.epipolar.start_interval import disparities_about
 from cosp.imaging.windows import Window, strip_of
-from cosp.io import arrays, heights, rasters, records, vectors
+from cosp.io import arrays, rasters, records
 from cosp.io.logs import log_to
 
 SMOOTH_BAND = 2  # of y_parallax.tif
@@ -55,9 +52,9 @@ def match_dense(
     start = None
     if start_interval_m:
         start = start_interval(
-            records.read(rectification_path, Rectification),
-            records.read(fore_camera_path, PanoramicCamera),
-            records.read(aft_camera_path, PanoramicCamera),
+            rectification_path,
+            fore_camera_path,
+            aft_camera_path,
             reference_dem_path,
             reference_dem_heights,
             unstable_path,
@@ -65,9 +62,13 @@ def match_dense(
             start_interval_m,
         )
 
+    with ThreadPoolExecutor(threads) as pool:
+        fore, aft = pool.map(
+            lambda path, window: rasters.read(path, window=window), (fore_path, aft_path), (seen, aft_seen)
+        )
     found = match(
-        rasters.read(fore_path, window=seen),
-        rasters.read(aft_path, window=aft_seen),
+        fore,
+        aft,
         tuple(disparity_range_px),
         y_parallax=smooth_y_parallax(y_parallax_path, header.grid).moved(seen.row0, 0),
         start=start,
@@ -101,8 +102,18 @@ def smooth_y_parallax(y_parallax_path, fore_grid):
     )
 
 
-def start_interval(rectification, fore, aft, dem_path, dem_heights, unstable_path, window, margin_m):
+def start_interval(rectification_path, fore_path, aft_path, dem_path, dem_heights, unstable_path, window, margin_m):
     """Disparities of ground near the reference DEM over a window of the fore image; None where there is no DEM."""
+    # Not asked for as a rule, and every strip would wait for these longer than for all else that it imports.
+    from pyproj import Transformer
+
+    from cosp.camera.panoramic import PanoramicCamera
+    from cosp.epipolar.rectification import Rectification
+    from cosp.epipolar.start_interval import disparities_about
+    from cosp.io import heights, vectors
+
+    rectification = records.read(rectification_path, Rectification)
+    fore, aft = (records.read(path, PanoramicCamera) for path in (fore_path, aft_path))
     rows, columns = (
         np.linspace(first, last - 1, FOOTPRINT_POINTS)
         for first, last in ((window.row0, window.row1), (window.column0, window.column1))

@@ -240,8 +240,7 @@ def _coarse_to_fine(
     low, high = range_px
     passes = plan_passes(high - low)
     levels = passes[0].level
-    lefts = picture_pyramid(np.ascontiguousarray(left), levels)
-    rights = picture_pyramid(np.ascontiguousarray(right), levels)
+    lefts, rights = pool.map(lambda one: picture_pyramid(np.ascontiguousarray(one), levels), (left, right))
     needed = _needed(passes, wanted, lefts)
     found: Float32Array | None = None
     level = levels

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-
 _LINE = 64  # bytes of a line of the cache: what crosses from one to the next takes twice as long to store
 
 
