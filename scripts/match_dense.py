@@ -14,6 +14,7 @@ from cosp.io.logs import log_to
 SMOOTH_BAND = 2  # of y_parallax.tif
 NODE_SPACING_PX = 64  # of the start interval
 FOOTPRINT_POINTS = 25  # a side
+BLOCKS_AT_ONCE = 64  # rows of blocks of the reference DEM
 
 
 def match_dense(
@@ -109,7 +110,8 @@ def start_interval(rectification_path, fore_path, aft_path, dem_path, dem_height
 
     from cosp.camera.panoramic import PanoramicCamera
     from cosp.epipolar.rectification import Rectification
-    from cosp.epipolar.start_interval import disparities_about
+    from cosp.epipolar.start_interval import POSTINGS, disparities_about
+    from cosp.imaging.resampling import block_extremes
     from cosp.io import heights, vectors
 
     rectification = records.read(rectification_path, Rectification)
@@ -123,23 +125,32 @@ def start_interval(rectification_path, fore_path, aft_path, dem_path, dem_height
     lonlat = lonlat[np.isfinite(lonlat).all(axis=-1)]
     info = rasters.info(dem_path)
     to_map = Transformer.from_crs("EPSG:4326", info.crs, always_xy=True)
-    places = info.grid.pixels(np.stack(to_map.transform(lonlat[:, 0], lonlat[:, 1]), axis=-1))
+    places = info.grid.pixels(np.stack(to_map.transform(*lonlat.T), axis=-1))
     ends = []
     for place, size in zip(places, info.shape, strict=True):
         margin = 0.05 * np.ptp(place) + 4.0
         ends += [max(0, int(place.min() - margin)), min(size, int(place.max() + margin))]
     if ends[0] >= ends[1] or ends[2] >= ends[3]:
         return None
+    # Cells that are smaller than nodes can tell apart are looked at in blocks.
+    cells_a_px = np.sqrt(np.prod([np.ptp(place) for place in places]) / np.prod(window.shape))
+    block = max(1, int(NODE_SPACING_PX / POSTINGS * cells_a_px))
     grid = info.grid.window(*ends)
-    height_m = heights.ellipsoidal_heights(dem_path, grid, info.crs, dem_heights)
-    unsure = vectors.rasterise(unstable_path, grid, info.crs) if unstable_path else np.zeros(grid.shape, bool)
-    centres = grid.centres()
-    lon, lat = to_map.transform(centres[..., 0], centres[..., 1], direction="INVERSE")
+    blocks = []
+    for row in range(0, grid.shape[0], block * BLOCKS_AT_ONCE):
+        part = grid.window(row, min(row + block * BLOCKS_AT_ONCE, grid.shape[0]), 0, grid.shape[1])
+        height_m = heights.ellipsoidal_heights(dem_path, part, info.crs, dem_heights)
+        unsure = vectors.rasterise(unstable_path, part, info.crs) if unstable_path else np.zeros(part.shape, bool)
+        blocks.append((*block_extremes(height_m, block), block_extremes(unsure, block)[1]))
+    lowest_m, highest_m, unsure = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    centres = grid.coarsened(block).centres()
     lowest, highest, spacing_px = disparities_about(
         rectification,
         fore.project_geodetic,
         aft.project_geodetic,
-        np.stack([lon, lat, height_m], axis=-1),
+        np.stack(to_map.transform(centres[..., 0], centres[..., 1], direction="INVERSE"), axis=-1),
+        lowest_m,
+        highest_m,
         unsure,
         window,
         margin_m=margin_m,
@@ -148,7 +159,8 @@ def start_interval(rectification_path, fore_path, aft_path, dem_path, dem_height
     low, high = rectification.disparity_range_px
     bound = (lowest > low) | (highest < high)
     logging.getLogger("match_dense").info(
-        "start interval from the reference DEM over %.0f %% of the strip, %.0f px wide in the middle",
+        "start interval from blocks of %d cells of the reference DEM over %.0f %% of the strip, %.0f px in the middle",
+        block,
         100 * bound.mean(),
         np.median((highest - lowest)[bound]) if bound.any() else high - low,
     )

@@ -11,14 +11,17 @@ from cosp.arrays import BoolArray, FloatArray
 from cosp.epipolar.rectification import Rectification
 from cosp.imaging.windows import Window
 
-_POSTINGS = 3.0  # points of the surface to a node, along and across, so that none is without
+POSTINGS = 3.0
+"""Points of the surface to a node, along and across, so that none is without."""
 
 
 def disparities_about(
     rectification: Rectification,
     fore: Callable[[FloatArray], FloatArray],
     aft: Callable[[FloatArray], FloatArray],
-    lonlath: FloatArray,
+    lonlat: FloatArray,
+    lowest_m: FloatArray,
+    highest_m: FloatArray,
     unsure: BoolArray,
     window: Window,
     *,
@@ -33,8 +36,10 @@ def disparities_about(
     ----------
     fore, aft : functions
         Film points (..., 2), mm, of longitudes, latitudes (degrees) and ellipsoidal heights (..., 3).
-    lonlath : (H, W, 3) array
-        The surface, on a grid; NaN height where it is not known.
+    lonlat : (H, W, 2) array, degrees
+        Places of the surface, on a grid.
+    lowest_m, highest_m : (H, W) arrays
+        Ellipsoidal heights of the surface about each; NaN where it is not known.
     unsure : (H, W) array
         Where the surface may have changed by more, as glaciers do.
     margin_m : float
@@ -51,8 +56,8 @@ def disparities_about(
     """
     columns = window.column1 - window.column0
     found = []
-    for shift in (-margin_m, margin_m):
-        ground = lonlath + np.array([0.0, 0.0, shift])
+    for height_m in (lowest_m - margin_m, highest_m + margin_m):
+        ground = np.concatenate([lonlat, height_m[..., None]], axis=-1)
         rows, fore_columns = rectification.fore_epipolar(fore(ground))
         _, aft_columns = rectification.aft_epipolar(aft(ground))
         found.append((rows - window.row0, fore_columns - window.column0, aft_columns - fore_columns))
@@ -61,7 +66,7 @@ def disparities_about(
         steps = [np.hypot(np.diff(down, axis=axis), np.diff(across, axis=axis)) for axis in (0, 1)]
     known = [step[np.isfinite(step)] for step in steps]
     posting_px = max((float(np.median(step)) for step in known if step.size), default=0.0)
-    spacing_px = max(least_spacing_px, _POSTINGS * posting_px)
+    spacing_px = max(least_spacing_px, POSTINGS * posting_px)
     shape = tuple(int(np.ceil(size / spacing_px)) + 1 for size in (window.row1 - window.row0, columns))
     lowest, highest, doubtful = np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape, bool)
     for down, across, disparity in found:

@@ -114,6 +114,14 @@ def block_mean(image: NDArray[Any], factor: int) -> NDArray[Any]:
     return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA))
 
 
+def block_extremes(values: NDArray[Any], factor: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Lowest and highest of what is given (not NaN) in factor x factor blocks; blocks at ragged edges hold less."""
+    pad = [(0, -n % factor) for n in values.shape]
+    padded = np.pad(values, pad, mode="edge") if any(p[1] for p in pad) else values
+    blocks = padded.reshape(padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
+    return np.fmin.reduce(blocks, axis=(1, 3)), np.fmax.reduce(blocks, axis=(1, 3))
+
+
 def pyramid(image: NDArray[Any], levels: int) -> list[NDArray[Any]]:
     """The image and `levels` halvings of it (Gaussian); pixel i of a level lies on pixel 2 i of the one before."""
     result = [image]

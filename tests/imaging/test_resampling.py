@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
-from cosp.imaging.resampling import block_mean, pyramid, sample, upsample_grid
+from cosp.imaging.resampling import block_extremes, block_mean, pyramid, sample, upsample_grid
 
 
 def waves(rows, columns):
@@ -53,3 +53,13 @@ def test_a_coarse_grid_is_bilinear_between_nodes_and_constant_beyond():
     grid = np.array([[0.0, 2.0], [4.0, 6.0]], np.float32)
     found = upsample_grid(grid, np.array([[0.5, -3.0]]), np.array([[0.5, 9.0]]))
     assert_allclose(found, [[3.0, 2.0]], atol=0.05)
+
+
+def test_extremes_of_blocks_are_of_what_is_given_also_at_ragged_edges():
+    values = np.arange(35, dtype=np.float32).reshape(5, 7)
+    values[0, 0] = values[2:4, 2:4] = np.nan
+    lowest, highest = block_extremes(values, 2)
+    assert_array_equal(lowest, [[1, 2, 4, 6], [14, np.nan, 18, 20], [28, 30, 32, 34]])
+    assert_array_equal(highest, [[8, 10, 12, 13], [22, np.nan, 26, 27], [29, 31, 33, 34]])
+    same = block_extremes(values, 1)
+    assert_array_equal(same, [values, values])
