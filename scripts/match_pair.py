@@ -51,7 +51,7 @@ def match_pair(
     crs = map_crs(cameras[0])
     heights_on = references.heights_on(reference_dem_path, crs, reference_dem_heights)
     films = [
-        FilmImage(rasters.info(path).grid, lambda window, path=path: rasters.read(path, window=window))
+        FilmImage(rasters.info(path).grid, lambda window, path=path: rasters.read(path, window=window, threads=threads))
         for path in (first_film_path, second_film_path)
     ]
     reason = None

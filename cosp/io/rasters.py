@@ -80,15 +80,21 @@ def info(path: str | Path) -> RasterInfo:
         )
 
 
-def read(path: str | Path, band: int | None = 1, window: Window | None = None) -> NDArray[Any]:
+def read(path: str | Path, band: int | None = 1, window: Window | None = None, *, threads: int = 1) -> NDArray[Any]:
     """Values of one band, or of all (bands, rows, columns) for `band=None`.
+
+    Parameters
+    ----------
+    path, band, window
+    threads : int
+        That decompress; more than one pay where a window holds many blocks and no other is read at the same time.
 
     Raises
     ------
     InputError
         If the file is missing, is no raster, or ends too soon.
     """
-    with _open(path) as dataset:
+    with _open(path, threads) as dataset:
         try:
             values: NDArray[Any] = dataset.read(
                 None if band is None else band, window=None if window is None else _rasterio_window(window)
@@ -257,12 +263,12 @@ def read_on_grid(
 
 
 @contextmanager
-def _open(path: str | Path) -> Iterator[DatasetReader]:
+def _open(path: str | Path, threads: int = 1) -> Iterator[DatasetReader]:
     if not Path(path).exists():
         raise InputError(f"{path}: no such file")
     try:
         with _quiet():
-            dataset = rasterio.open(path)
+            dataset = rasterio.open(path, **({"num_threads": threads} if threads > 1 else {}))
     except RasterioIOError as error:
         raise InputError(f"{path}: not a raster that can be read ({error})") from error
     with dataset:

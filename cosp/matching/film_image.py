@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,7 @@ class FilmImage:
         """The same film, read by pieces along it of which the last few are kept, for many small windows in turn."""
         rows, columns = self.grid.shape
         read = self.read
+        lock = Lock()  # what two threads want at once is read once
 
         @lru_cache(_KEPT_PIECES)
         def piece(number: int) -> NDArray[Any]:
@@ -71,7 +73,8 @@ class FilmImage:
             numbers = range(window.column0 // _PIECE_COLUMNS, (window.column1 - 1) // _PIECE_COLUMNS + 1)
             first = numbers.start * _PIECE_COLUMNS
             chosen = slice(window.column0 - first, window.column1 - first)
-            pieces = [piece(number)[window.row0 : window.row1] for number in numbers]
+            with lock:
+                pieces = [piece(number)[window.row0 : window.row1] for number in numbers]
             return (pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=1))[:, chosen]
 
         return FilmImage(self.grid, read_buffered)

@@ -45,6 +45,14 @@ def test_windows_are_the_same_pixels(tmp_path):
     assert np.array_equal(rasters.read(tmp_path / "w.tif", window=window), heights()[window.slices])
 
 
+def test_threads_that_decompress_change_no_pixel(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (1300, 1700), dtype=np.uint8)
+    rasters.write(tmp_path / "t.tif", pixels, grid=MAP)
+    window = Window(100, 1250, 3, 1600)
+    for threads in (1, 2, 5):
+        assert np.array_equal(rasters.read(tmp_path / "t.tif", window=window, threads=threads), pixels[window.slices])
+
+
 def test_a_failed_write_leaves_nothing(tmp_path):
     def fail():
         with rasters.create(tmp_path / "w.tif", shape=(40, 50), dtype="uint8", grid=MAP, crs=None):
