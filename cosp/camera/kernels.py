@@ -98,6 +98,7 @@ def derivatives(
         Filled; NaN where the film point is.
     """
     sign = 1.0 if tau_per_mm > 0 else -1.0
+    # Filled one by one: assigning whole rows takes the compiler many times as long.
     by_n = np.empty((16, 3))
     turn = np.empty((3, 3))
     n = np.empty(3)
@@ -110,9 +111,9 @@ def derivatives(
         so, co = math.sin(omega), math.cos(omega)
         sp, cp = math.sin(phi), math.cos(phi)
         sk, ck = math.sin(kappa), math.cos(kappa)
-        turn[0] = (cp * ck, co * sk + so * sp * ck, so * sk - co * sp * ck)
-        turn[1] = (-cp * sk, co * ck - so * sp * sk, so * ck + co * sp * sk)
-        turn[2] = (sp, -so * cp, co * cp)
+        turn[0, 0], turn[0, 1], turn[0, 2] = (cp * ck, co * sk + so * sp * ck, so * sk - co * sp * ck)
+        turn[1, 0], turn[1, 1], turn[1, 2] = (-cp * sk, co * ck - so * sp * sk, so * ck + co * sp * sk)
+        turn[2, 0], turn[2, 1], turn[2, 2] = (sp, -so * cp, co * cp)
         dx = ground_m[i, 0] - parameters[0] - tau * parameters[3]
         dy = ground_m[i, 1] - parameters[1] - tau * parameters[4]
         dz = ground_m[i, 2] - parameters[2] - tau * parameters[5]
@@ -127,10 +128,12 @@ def derivatives(
             by_n[6, r] = turn[r, 1] * dz - turn[r, 2] * dy
             by_n[12, r] = 0.0
         # Phi turns about the y axis that kappa then turns to (sin kappa, cos kappa, 0): dN = -axis x N.
-        by_n[7] = (-ck * n[2], sk * n[2], ck * n[0] - sk * n[1])
+        by_n[7, 0], by_n[7, 1], by_n[7, 2] = (-ck * n[2], sk * n[2], ck * n[0] - sk * n[1])
         # Kappa turns last, about the camera's z axis.
-        by_n[8] = (n[1], -n[0], 0.0)
-        by_n[9:12] = tau * by_n[6:9]
+        by_n[8, 0], by_n[8, 1], by_n[8, 2] = (n[1], -n[0], 0.0)
+        for r in range(3):
+            for k in range(6, 9):
+                by_n[k + 3, r] = tau * by_n[k, r]
 
         sine, cosine = math.sin(x / focal_mm), math.cos(x / focal_mm)
         slope = n[1] / n[2]
