@@ -99,10 +99,9 @@ def film_points(
                 reached[x] = u[x] if abs(w) <= limit else np.inf
         else:
             w = row_scale[0] + row_scale[1] * rows[y, 0]
-            if abs(w) <= limit:
-                reached[:] = u
-            else:
-                reached[:] = np.inf
+            known = abs(w) <= limit
+            for x in range(width):
+                reached[x] = u[x] if known else np.inf
         for x in range(width):
             inside = abs(reached[x]) <= limit
             a = a_u * u[x] + a_v * v[x] + a_1
@@ -203,7 +202,9 @@ def cut(picture: ByteArray, row: IntArray, column: IntArray, windows: ByteArray)
     height, width = windows.shape[1:]
     for n in range(row.size):
         for y in range(height):
-            windows[n, y] = picture[row[n] + y, column[n] : column[n] + width]
+            line = picture[row[n] + y, column[n] : column[n] + width]
+            for x in range(width):
+                windows[n, y, x] = line[x]
 
 
 @njit(nogil=True, cache=True)
@@ -247,11 +248,9 @@ def correlate(templates: ByteArray, searches: ByteArray, flat: float, surfaces: 
     sums = np.empty(searches.shape[2])
     squares = np.empty(searches.shape[2])
     for n in range(len(templates)):
-        template[:] = templates[n]
-        search[:] = searches[n]
-        t_sum, t_square = _sums_of(template)
+        t_sum, t_square = _as_floats(templates[n], template)
         t_energy = t_square - t_sum * t_sum / pixels
-        s_sum, s_square = _sums_of(search)
+        s_sum, s_square = _as_floats(searches[n], search)
         least = flat * (s_square - s_sum * s_sum / search.size) / search.size * pixels
         sums[:] = 0.0
         squares[:] = 0.0
@@ -291,11 +290,15 @@ def correlate(templates: ByteArray, searches: ByteArray, flat: float, surfaces: 
 
 
 @njit(nogil=True, cache=True)
-def _sums_of(picture: Float32Array) -> tuple[float, float]:
-    """Sum and sum of squares."""
+def _as_floats(window: ByteArray, floats: Float32Array) -> tuple[float, float]:
+    """Fill floats with the pixels of a window; their sum and the sum of their squares."""
     total = 0.0
     square = 0.0
-    for value in picture.ravel():
-        total += float(value)
-        square += float(value * value)
+    # One by one: assigning whole arrays takes the compiler many times as long.
+    for y in range(window.shape[0]):
+        for x in range(window.shape[1]):
+            value = float(window[y, x])
+            floats[y, x] = value
+            total += value
+            square += value * value
     return total, square
