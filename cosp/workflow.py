@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -103,6 +104,11 @@ def film_mpx(scene: Scene) -> float:
 def memory_mb(mpx: float, *, bytes_per_px: float, base_mb: float = 600.0) -> int:
     """Memory to ask for: what the interpreter and its libraries take, and so many bytes a pixel."""
     return math.ceil(base_mb + mpx * bytes_per_px)
+
+
+def machine_memory_mb() -> int:
+    """Memory of this machine that jobs may ask for together: nine tenths of it."""
+    return int(0.9 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6)
 
 
 def runtime_min(mpx: float, *, us_per_px: float, threads: int = 1) -> int:

@@ -22,6 +22,11 @@ wildcard_constraints:
     aft="|_aft",
 
 
+# Jobs of one machine share its memory as they share its cores, unless a limit is given; a cluster has limits of its own.
+if workflow.nodes is None and "mem_mb" not in workflow.global_resources:
+    workflow.register_resource("mem_mb", house.machine_memory_mb())
+
+
 scattergather:
     match_tiles=house.strip_count(project, house.LARGEST_CONTROL_STRIP_MPX),
     match_dense=house.strip_count(project),

@@ -16,9 +16,10 @@ rule match_dense:
         "benchmarks/match_dense/{pair}_{scatteritem}.jsonl"
     conda:
         "../envs/cosp.yaml"
-    threads: 2
+    # Strips side by side keep cores busier than threads within one, which wait while it starts, reads and writes.
+    threads: 1
     resources:
-        mem_mb=memory(4),
+        mem_mb=memory(3),
         runtime=runtime(1),
     params:
         **choices("match_dense"),

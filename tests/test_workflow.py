@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
 from cosp import sheets, workflow
@@ -118,6 +119,11 @@ def test_memory_and_time_grow_with_the_film_and_never_vanish() -> None:
     assert workflow.memory_mb(0, bytes_per_px=4) == 600
     assert workflow.runtime_min(1000, us_per_px=1.0) > workflow.runtime_min(1000, us_per_px=1.0, threads=2) > 10
     assert workflow.runtime_min(1, us_per_px=0.1) == 10
+
+
+def test_jobs_share_most_of_the_memory_there_is() -> None:
+    total_mb = psutil.virtual_memory().total / 1e6
+    assert 0.8 * total_mb < workflow.machine_memory_mb() < total_mb
 
 
 def test_parts_that_are_there_are_named_and_a_joined_film_stands_for_them(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([*describe, "--pixel-um", str(PIXEL_UM)], check=True, cwd=folder)
     done = _snakemake(folder, "--show-failed-logs")
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-8000:]
+    assert "Provided resources: mem_mb=" in done.stdout + done.stderr, "jobs share the memory of the machine"
     return folder
 
 
