@@ -8,7 +8,8 @@ import numpy as np
 from cosp.camera.mapping import MapProjector
 from cosp.camera.panoramic import PanoramicCamera
 from cosp.geometry.grids import PixelGrid
-from cosp.imaging.windows import Window, tiles, worked_on
+from cosp.imaging.resampling import block_mean
+from cosp.imaging.windows import tiles, worked_on
 from cosp.io import rasters, records
 from cosp.io.heights import ellipsoidal_heights
 from cosp.io.logs import log_to
@@ -16,6 +17,7 @@ from cosp.surface.orthophoto import (
     cells_below,
     direction_to_lens,
     fill_heights,
+    film_about,
     film_of_cells,
     film_window,
     heights_on,
@@ -27,7 +29,8 @@ from cosp.surface.orthophoto import (
 )
 
 COARSE = 8  # cells over which heights are averaged to be compared with the reference DEM
-ROWS_AT_ONCE = 512
+ROWS_AT_ONCE = 512  # of the DEM: a multiple of the above
+TILE = 1024  # cells a side: larger ones read less of film and heights twice, and take more memory
 
 
 def orthorectify(
@@ -48,8 +51,9 @@ def orthorectify(
     dem = rasters.info(dem_path)
     grid, crs = dem.grid, dem.crs
     coarse = ellipsoidal_heights(reference_dem_path, grid.coarsened(COARSE), crs, reference_dem_heights)
-    shift_m = median_shift(rasters.read_reduced(dem_path, COARSE), coarse)
-    lowest_m, highest_m = height_range(dem_path, grid.shape)
+    with ThreadPoolExecutor(threads) as pool:
+        reduced_m, lowest_m, highest_m = look_through(dem_path, grid.shape, pool, ahead=threads)
+    shift_m = median_shift(reduced_m, coarse)
     lowest_m = min(lowest_m, float(np.nanmin(coarse, initial=np.inf)) + shift_m)
     highest_m = max(highest_m, float(np.nanmax(coarse, initial=-np.inf)) + shift_m)
 
@@ -75,6 +79,8 @@ def orthorectify(
 
     def expose(tile):
         part = ortho_grid.window(tile.row0, tile.row1, tile.column0, tile.column1)
+        if film_window(film_grid, film_about(film_of, part, lowest_m, highest_m)) is None:
+            return np.zeros(tile.shape, np.uint8)
         below = cells_below(grid, part)
         ground = grid.window(below.row0, below.row1, below.column0, below.column1)
         directions = direction_to_lens(locate, ground, film_of)
@@ -90,7 +96,7 @@ def orthorectify(
         film_part = film_grid.window(window.row0, window.row1, window.column0, window.column1)
         return sample_film(film, film_part, film_mm, nearest_on(hidden, ground, part))
 
-    every = tiles(ortho_grid.shape, 512)
+    every = tiles(ortho_grid.shape, TILE)
     with (
         rasters.create(
             ortho_path,
@@ -110,14 +116,21 @@ def orthorectify(
                 log.info("exposed %d/%d tiles", number, len(every))
 
 
-def height_range(dem_path, shape):
-    """Lowest and highest of the heights of a DEM, read by strips."""
-    low, high = np.inf, -np.inf
-    for row in range(0, shape[0], ROWS_AT_ONCE):
-        heights_m = rasters.read(dem_path, window=Window(row, min(row + ROWS_AT_ONCE, shape[0]), 0, shape[1]))
-        low = min(low, float(np.nanmin(heights_m, initial=np.inf)))
-        high = max(high, float(np.nanmax(heights_m, initial=-np.inf)))
-    return low, high
+def look_through(dem_path, shape, pool, *, ahead):
+    """Heights of a DEM averaged over `COARSE` cells a side, the lowest and the highest of all, read by strips."""
+
+    def look_at(window):
+        heights_m = rasters.read(dem_path, window=window)
+        ends = (f.reduce(heights_m, axis=None) for f in (np.fmin, np.fmax))
+        return block_mean(heights_m, COARSE), *ends
+
+    strips = tiles(shape, (ROWS_AT_ONCE, shape[1]))
+    reduced_m, lows, highs = zip(*(seen for _, seen in worked_on(pool, look_at, strips, ahead=ahead)), strict=True)
+    return (
+        np.concatenate(reduced_m),
+        float(np.nanmin(lows, initial=np.inf)),
+        float(np.nanmax(highs, initial=-np.inf)),
+    )
 
 
 if __name__ == "__main__":

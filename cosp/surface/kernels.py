@@ -324,6 +324,9 @@ def points_in_cells(
         result[n, 3] = weights[n]
 
 
+_BLOCK = 32  # cells a side, of which the highest is known beforehand
+_LEAST_MOVE = 1e-12  # cells per metre of height, for what does not move at all
+
 # Places in the lines of points, four numbers each: with a distance from point to point that the compiler knows, and
 # unsigned, for what cannot be negative need not be looked at as counted from the end.
 _ONE, _TWO, _THREE, _FOUR = (np.uint64(k) for k in (1, 2, 3, 4))
@@ -767,6 +770,30 @@ def _solve_run(lines: FloatArray, slopes: FloatArray, side: float, slope_weight:
 
 
 @njit(nogil=True, cache=True)
+def highest_of_blocks(heights: FloatArray) -> FloatArray:
+    """Highest of the cells of each block of `_BLOCK` a side and of the cells around it; -inf where all are missing."""
+    rows, columns = heights.shape
+    highest = np.full(((rows + _BLOCK - 1) // _BLOCK, (columns + _BLOCK - 1) // _BLOCK), -np.inf, np.float32)
+    for i in range(highest.shape[0]):
+        for j in range(highest.shape[1]):
+            largest = np.float32(-np.inf)
+            for row in range(max(i * _BLOCK - 1, 0), min((i + 1) * _BLOCK + 1, rows)):
+                for column in range(max(j * _BLOCK - 1, 0), min((j + 1) * _BLOCK + 1, columns)):
+                    # A NaN here compares false.
+                    if heights[row, column] > largest:
+                        largest = heights[row, column]
+            highest[i, j] = largest
+    return highest
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _steps_to_leave(place: float, cell: int, forward: bool, steps_per_cell: float) -> float:
+    """Steps that a place in a cell needs to leave the block of cells."""
+    inside = place - cell // _BLOCK * _BLOCK
+    return (_BLOCK - inside if forward else inside) * steps_per_cell
+
+
+@njit(nogil=True, cache=True)
 def hidden_cells(
     heights: FloatArray,
     per_height_columns: FloatArray,
@@ -782,9 +809,10 @@ def hidden_cells(
 
     `per_height_columns` and `per_height_rows` (of the window's shape) are cells moved towards
     the lens per metre of height. The line of sight is followed cell by cell over `heights`
-    until it is above `top`.
+    until it is above `top`; blocks of cells that lie below it are passed at once.
     """
     rows, columns = heights.shape
+    highest = highest_of_blocks(heights)
     hidden = np.zeros((row1 - row0, column1 - column0), np.bool_)
     for row in range(row0, row1):
         for column in range(column0, column1):
@@ -797,6 +825,8 @@ def hidden_cells(
             if reach <= 0.0:
                 continue
             rise = 1.0 / reach
+            steps_c = reach / max(abs(move_c), _LEAST_MOVE)
+            steps_r = reach / max(abs(move_r), _LEAST_MOVE)
             step = 1
             sight = height + rise
             while sight < top:
@@ -806,6 +836,12 @@ def hidden_cells(
                     break
                 j = int(c)
                 i = int(r)
+                if highest[i // _BLOCK, j // _BLOCK] <= sight + tolerance:
+                    stay = _steps_to_leave(c, j, move_c > 0.0, steps_c)
+                    stay = min(stay, _steps_to_leave(r, i, move_r > 0.0, steps_r))
+                    step += max(int(stay), 1)
+                    sight = height + step * rise
+                    continue
                 p = c - j
                 q = r - i
                 upper = heights[i, j] + p * (heights[i, j + 1] - heights[i, j])

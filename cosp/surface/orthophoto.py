@@ -13,7 +13,9 @@ from cosp.imaging.resampling import sample
 from cosp.imaging.windows import Window
 from cosp.surface import kernels
 
+_SAME_CELL = 1e-6  # cells by which places may differ from rounding alone
 _NODE_CELLS = 32  # the direction to the lens changes by a millionth per metre: linear between such nodes
+_NODES_ABOUT = 9  # a side; between them the edge of a tile on the film is straight to a few pixels
 _FILM_NODE_CELLS = 8  # film points are linear between such nodes to a hundredth of a pixel, at postings of 30 m too
 
 
@@ -83,6 +85,15 @@ def film_of_cells(
         )
         film[..., i] = constant + part * (slope + part * bend)
     return film
+
+
+def film_about(
+    film_mm: Callable[[FloatArray, FloatArray], FloatArray], grid: PixelGrid, lowest_m: float, highest_m: float
+) -> FloatArray:
+    """Film points of a few cells of a grid at two heights: between them lies all that its ground can be seen at."""
+    rows, columns = (np.linspace(-0.5, n - 0.5, _NODES_ABOUT) for n in grid.shape)
+    nodes = grid.points(rows[:, None], columns[None, :])
+    return np.stack([film_mm(nodes, np.full(nodes.shape[:2], h)) for h in (lowest_m, highest_m)])
 
 
 def hidden_from_lens(
@@ -184,6 +195,9 @@ def cells_below(grid: PixelGrid, part: PixelGrid) -> Window:
 
 def heights_on(heights_m: Float32Array, grid: PixelGrid, part: PixelGrid) -> Float32Array:
     """Heights at the cells of another grid; bilinear, the model's own where both grids agree."""
+    same = _same_cells(grid, part)
+    if same is not None:
+        return heights_m[same.slices]
     return np.asarray(
         sample(heights_m, *grid.pixels(part.centres()), interpolation="linear", border=np.nan), np.float32
     )
@@ -191,15 +205,31 @@ def heights_on(heights_m: Float32Array, grid: PixelGrid, part: PixelGrid) -> Flo
 
 def nearest_on(values: BoolArray, grid: PixelGrid, part: PixelGrid) -> BoolArray:
     """Marks of a grid at the cells of another one, the nearest each."""
+    same = _same_cells(grid, part)
+    if same is not None:
+        return values[same.slices]
     rows, columns = grid.pixels(part.centres())
     return np.asarray(sample(values.astype(np.uint8), rows, columns, interpolation="nearest") > 0)
 
 
+def _same_cells(grid: PixelGrid, part: PixelGrid) -> Window | None:
+    """The window of a grid whose cells those of another one are; None if they lie between its cells or beyond."""
+    if (grid.step_x, grid.step_y) != (part.step_x, part.step_y):
+        return None
+    place = grid.pixels(np.array([part.x0, part.y0]))
+    row, column = (round(float(v)) for v in place)
+    window = Window(row, row + part.shape[0], column, column + part.shape[1])
+    if max(abs(place[0] - row), abs(place[1] - column)) > _SAME_CELL or window != window.grown(0, grid.shape):
+        return None
+    return window
+
+
 def film_window(film_grid: PixelGrid, film_mm: FloatArray, reach_px: int = 6) -> Window | None:
     """The part of a film that holds the given film points and what a resampling kernel reaches; None if none does."""
-    rows, columns = film_grid.pixels(film_mm[np.isfinite(film_mm).all(-1)])
-    if not rows.size:
+    ends = [[f(film_mm[..., i], axis=None) for i in range(2)] for f in (np.fmin.reduce, np.fmax.reduce)]
+    if not np.isfinite(ends).all():
         return None
+    rows, columns = film_grid.pixels(ends)
     bounds = Window(
         int(np.floor(max(rows.min(), -1e6))) - reach_px,
         int(np.ceil(min(rows.max(), 1e6))) + reach_px + 1,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.ndimage import gaussian_filter
 
 from cosp.camera.mapping import MapProjector
 from cosp.geometry.grids import PixelGrid
@@ -13,6 +14,7 @@ from cosp.surface.orthophoto import (
     cells_below,
     direction_to_lens,
     fill_heights,
+    film_about,
     film_of_cells,
     film_window,
     heights_on,
@@ -144,6 +146,52 @@ def test_missing_heights_hide_nothing():
     whole = Window(0, 50, 0, 50)
     assert not hidden_from_lens(heights, whole, grid, slant, slant, tolerance_m=0.0).any()
     assert not hidden_from_lens(heights * np.nan, whole, grid, slant, slant, tolerance_m=0.0).any()
+
+
+@pytest.mark.parametrize("move", [(0.04, 0.07), (-0.05, 0.02), (0.06, 0.0), (-0.03, -0.03)])
+def test_lines_of_sight_that_pass_over_blocks_at_once_see_what_single_steps_see(move):
+    """Lines over a rough ground of many blocks, each followed cell by cell in plain Python."""
+    rng = np.random.default_rng(4)
+    shape = (150, 140)
+    heights = gaussian_filter(rng.normal(0, 1, shape), 6)
+    heights = (800 + 700 * heights / heights.std() + rng.normal(0, 8, shape)).astype(np.float32)
+    heights[70:80, 20:60] = np.nan
+    grid = PixelGrid(0.0, 0.0, 10.0, -10.0, shape)
+    east, north = np.full(shape, move[0] * 10.0), np.full(shape, -move[1] * 10.0)
+    found = hidden_from_lens(heights, Window(0, shape[0], 0, shape[1]), grid, east, north, tolerance_m=3.0)
+    step_m = 1 / max(abs(v) for v in move)
+    top = np.nanmax(heights)
+    expected = np.zeros(shape, bool)
+    for row, column in np.argwhere(np.isfinite(heights)):
+        height = float(heights[row, column])
+        for n in range(1, int((top - height) / step_m) + 1):
+            c, r, sight = column + n * step_m * move[0], row + n * step_m * move[1], height + n * step_m
+            if not (0 <= c < shape[1] - 1 and 0 <= r < shape[0] - 1):
+                break
+            i, j = int(r), int(c)
+            (a, b), (d, e) = heights[i : i + 2, j : j + 2].astype(float)
+            upper, lower = a + (c - j) * (b - a), d + (c - j) * (e - d)
+            if upper + (r - i) * (lower - upper) > sight + 3.0:
+                expected[row, column] = True
+                break
+    assert 0.05 < expected.mean() < 0.8
+    # Steps and heights are rounded otherwise.
+    assert (found != expected).sum() <= 3
+
+
+def test_a_tile_beside_the_film_is_known_by_a_few_of_its_cells(fore, grid):
+    projector = MapProjector(fore, CRS, grid.bounds)
+
+    def film_of(xy, h):
+        return projector.film(xy[..., 0], xy[..., 1], h)
+
+    about = film_about(film_of, grid, 400.0, 2400.0)
+    rng = np.random.default_rng(2)
+    film_mm = film_of(grid.centres(), rng.uniform(400.0, 2400.0, grid.shape))
+    # All that can be seen of the tile lies within, but for the little that its edge is bent.
+    assert (film_mm.min((0, 1)) > about.min((0, 1, 2)) - 2 * FILM_GRID.step_x).all()
+    assert (film_mm.max((0, 1)) < about.max((0, 1, 2)) + 2 * FILM_GRID.step_x).all()
+    assert film_window(FILM_GRID, about + 500) is None
 
 
 def test_hidden_cells_are_those_whose_ray_meets_other_terrain_first(fore):
