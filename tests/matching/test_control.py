@@ -114,6 +114,26 @@ def test_good_matches_become_control_and_check_and_gross_errors_are_rejected():
     assert kept["sigma_height_m"].between(4.0, np.hypot(4.0, 0.3 * 3.0) + 0.01).all()
 
 
+def test_weak_matches_with_relief_are_control_where_most_agree_and_none_where_the_film_shows_a_plain():
+    camera, rng = make_camera(), np.random.default_rng(4)
+    film_mm, lonlath = film_points(camera, rng, 1200)
+    matches = matches_of(film_mm, lonlath, rng=rng).assign(score=0.1, template_px=65)
+    plain = film_mm[:, 0] > 0
+    astray = plain | (rng.random(len(matches)) < 0.3)
+    chance = rng.uniform(-3.0, 3.0, (len(matches), 2))
+    matches.loc[astray, ["x_mm", "y_mm"]] += chance[astray]
+    gcps, summary = gathered(matches, camera, relief=True, min_gcps=20)
+    kept = gcps[gcps["role"] != "rejected"]
+    right = film_mm[~astray]
+    distance = np.linalg.norm(kept[["x_mm", "y_mm"]].to_numpy()[:, None] - right, axis=2).min(axis=1)
+    assert 0.6 * len(right) < summary["agreeing"] < 1.05 * len(right)
+    assert len(kept) > 100
+    assert (distance < 0.3).mean() > 0.98
+    assert (kept["x_mm"] < 5.0).all()
+    with pytest.raises(NotEnoughMatchesError, match="0 of the 20 ground control points"):
+        gathered(matches[plain], camera, relief=True, min_gcps=20)
+
+
 def test_what_a_matcher_states_is_scaled_by_what_neighbours_say():
     camera, rng = make_camera(), np.random.default_rng(9)
     matches = matches_of(*film_points(camera, rng, 1500), sigma_px=0.3, rng=rng)
