@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from cosp.arrays import Float32Array
 from cosp.errors import InputError
 from cosp.geometry.grids import PixelGrid
 from cosp.imaging.resampling import block_mean
-from cosp.imaging.windows import Window
+from cosp.imaging.windows import Window, tiles, worked_on
 from cosp.io.temporary import temporary_for
 
 FILM_CRS = 'LOCAL_CS["film, millimetres from the centre of format",UNIT["millimetre",0.001]]'
@@ -183,7 +184,10 @@ def create(
         "bigtiff": "if_safer",
         "num_threads": threads,
     }
-    if compressed:
+    if cog:
+        # Compressed when it is copied into its last form: until then only as small as blocks left out make it.
+        options["sparse_ok"] = True
+    elif compressed:
         options |= {"compress": "zstd", "zstd_level": 1, "predictor": 3 if floating else 2}
     try:
         with _quiet(), rasterio.open(temporary, "w", **options) as dataset:
@@ -192,7 +196,7 @@ def create(
             dataset.update_tags(**dict(tags or {}))
             yield RasterWriter(dataset)
         if cog:
-            _to_cog(temporary, floating, threads)
+            _to_cog(temporary, options)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -283,9 +287,17 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _to_cog(path: Path, floating: bool, threads: int) -> None:
+def _to_cog(path: Path, options: dict[str, Any]) -> None:
     target = path.with_name(f"{path.stem}.cog{path.suffix}")
+    overviews: list[Path] = []
     try:
+        finer = path
+        while max(options["height"], options["width"]) > _TILE:
+            # GDAL takes what lies beside a raster under this name for its overview, and so on.
+            finer = Path(f"{finer}.ovr")
+            overviews.append(finer)
+            options = options | {side: -(-options[side] // 2) for side in ("height", "width")}
+            _write_halved(finer.with_suffix(""), finer, options)
         copy_dataset(
             path,
             target,
@@ -294,12 +306,46 @@ def _to_cog(path: Path, floating: bool, threads: int) -> None:
             level=1,
             predictor="yes",
             bigtiff="if_safer",
-            overview_resampling="average",
-            num_threads=threads,
+            sparse_ok="yes",
+            num_threads=options["num_threads"],
         )
         target.replace(path)
     finally:
-        target.unlink(missing_ok=True)
+        for left in (target, *overviews):
+            left.unlink(missing_ok=True)
+
+
+def _write_halved(path: Path, target: Path, options: dict[str, Any]) -> None:
+    """Write a raster of half the rows and columns, whose pixels are means of the known ones of two by two."""
+
+    def halved(window: Window) -> NDArray[Any]:
+        fine = Window(2 * window.row0, 2 * window.row1, 2 * window.column0, 2 * window.column1)
+        return np.stack([_halved(values, options["nodata"]) for values in read(path, None, fine.grown(0, shape))])
+
+    shape = info(path).shape
+    windows = tiles((options["height"], options["width"]), _TILE)
+    with (
+        _quiet(),
+        rasterio.open(target, "w", **options) as dataset,
+        ThreadPoolExecutor(options["num_threads"]) as pool,
+    ):
+        for window, values in worked_on(pool, halved, windows, ahead=2 * options["num_threads"]):
+            dataset.write(values, window=_rasterio_window(window))
+
+
+def _halved(values: NDArray[Any], nodata: float | None) -> NDArray[Any]:
+    """Means of the known pixels of two by two, `nodata` where none is known."""
+    floating = np.issubdtype(values.dtype, np.floating)
+    known = np.isfinite(values) if floating else values != nodata
+    if not known.any():
+        return np.full([-(-n // 2) for n in values.shape], nodata, values.dtype)
+    total = block_mean(np.where(known, values, 0).astype(np.float32), 2)
+    share = block_mean(known.astype(np.float32), 2)
+    empty = share == 0
+    means = total / np.where(empty, np.float32(1), share)
+    if not floating:
+        means = np.floor(means + np.float32(0.5))
+    return np.where(empty, np.float32(nodata or 0), means).astype(values.dtype)
 
 
 def _rasterio_window(window: Window) -> RasterioWindow:

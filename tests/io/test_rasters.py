@@ -119,6 +119,30 @@ def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == [other.name, "h.tif"]
 
 
+@pytest.mark.parametrize(("dtype", "nodata"), [(np.float32, np.nan), (np.uint8, 0)])
+def test_overviews_hold_the_means_of_known_pixels_whatever_their_number(tmp_path, dtype, nodata):
+    """Odd sides and gaps, two levels; a whole block without values stays without."""
+    rng = np.random.default_rng(3)
+    values = rng.uniform(1, 255, (2, 1301, 1799)).astype(dtype)
+    values[rng.random(values.shape) < 0.4] = nodata
+    values[:, 40:90, 100:200] = nodata
+    values[:, 512:1024, 512:1024] = nodata
+    path = tmp_path / "c.tif"
+    rasters.write(path, values, grid=PixelGrid.covering((0, 0, 17990, 13010), 10.0), nodata=nodata, cog=True)
+    assert np.array_equal(rasters.read(path, None), values, equal_nan=dtype == np.float32)
+    finer = np.where(values == nodata, np.nan, values).astype(float)
+    for level in range(2):
+        padded = np.pad(finer, [(0, 0), *((0, n % 2) for n in finer.shape[1:])], constant_values=np.nan)
+        blocks = np.stack([padded[:, i::2, j::2] for i in range(2) for j in range(2)])
+        known = np.isfinite(blocks).sum(0)
+        means = np.where(known, np.nansum(blocks, 0) / np.maximum(known, 1), np.nan)
+        with rasterio.open(path, overview_level=level) as dataset:
+            found = dataset.read().astype(float)
+        finer = np.where(found == nodata, np.nan, found)
+        np.testing.assert_allclose(finer, means, atol=0.5 if dtype == np.uint8 else 1e-4)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.tif"]
+
+
 @pytest.mark.parametrize("cog", [False, True])
 def test_threads_that_compress_change_no_byte(tmp_path, cog):
     values = np.random.default_rng(3).normal(0, 1, (1200, 1300)).astype(np.float32).round(2)
