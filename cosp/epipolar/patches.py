@@ -21,7 +21,7 @@ from cosp.imaging.windows import Window
 Reader = Callable[[Window], ByteArray]
 _HALO_PX = 4  # what interpolation between reduced pixels reaches
 # Reduced pixels from one place of a window to the next whose film point is worked out; in between bilinear, which is
-# within a thousandth of such a pixel at full size and a thirtieth where sizes are halved five times.
+# within 0.0025 of such a pixel at every size.
 _NODE_PX = 8
 _FAR_PX = -1e6  # stands for "nowhere"
 _AT_ONCE = 256  # windows resampled in one call
