@@ -17,11 +17,11 @@ from cosp.io import rasters, records
 from cosp.io.logs import log_to
 from cosp.surface.gridding import HALO_CELLS, CellPoints, boxes_meeting, confidence_weights, grid_cells, map_boxes
 from cosp.surface.intersection import PixelIntersection
-from cosp.surface.orthophoto import film_of_cells
+from cosp.surface.orthophoto import on_surface
 
 CONFIDENCE_BAND = 2  # of validity.tif
 SMOOTH_BAND = 2  # of y_parallax.tif: the field that dense matching allowed for
-TILE_M = 5000.0  # ground of one job of a thread: about five million points of a 7 um film
+TILE_M = 5120.0  # ground of one job of a thread: about five million points of a 7 um film
 WINDOWS_AT_HAND = 40  # whose points are kept for the tiles to come: up to 17 MB each
 
 
@@ -73,6 +73,9 @@ def grid_dem(
         projector = MapProjector(fore, crs, grid.bounds)
         of_cameras = records.read(height_sigma_path, HeightSigma)
 
+    def sigma_of_cameras(xy, height_m):
+        return of_cameras.at(projector.film(xy[..., 0], xy[..., 1], height_m))[..., None]
+
     weights = confidence_weights(least_confidence)
 
     def map_points(number):
@@ -111,10 +114,9 @@ def grid_dem(
         inner = tile.inside(grown).slices
         height_m, sigma_m, count = found.height_m[inner], found.sigma_m[inner], found.count[inner]
         camera_sigma_m = np.where(np.isfinite(height_m), np.float32(0), np.float32(np.nan))
-        if of_cameras is not None:
+        if of_cameras is not None and np.isfinite(height_m).any():
             cells = grid.window(tile.row0, tile.row1, tile.column0, tile.column1)
-            film_mm = film_of_cells(lambda xy, h: projector.film(xy[..., 0], xy[..., 1], h), cells, height_m)
-            camera_sigma_m = of_cameras.at(film_mm).astype(np.float32)
+            camera_sigma_m = on_surface(sigma_of_cameras, cells, height_m)[0]
         return height_m, np.hypot(sigma_m, camera_sigma_m), count, camera_sigma_m
 
     every = tiles(grid.shape, int(np.clip(TILE_M / resolution_m, 64, 512)))

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 from pyproj import Transformer
 
 from cosp.arrays import Float32Array, FloatArray, IntArray
@@ -21,6 +25,9 @@ HALO_CELLS = 4  # what `grid_points` needs around a tile to give the heights of 
 _MOST_CONFIDENCE = 255
 _SLOPE_WEIGHT = 0.1  # points; holds slopes where the points lie on a line, without a say elsewhere
 _NEIGHBOURS_TO_FILL = 5  # of 8: closes holes of a cell and slits of one cell, does not grow the edge
+
+
+_rooms = threading.local()
 
 
 @dataclass(frozen=True)
@@ -147,37 +154,48 @@ def grid_cells(
     -----
     Windows with a halo of `HALO_CELLS` cells give the heights of the whole.
     """
-    rows, columns = window.shape
     ordered, starts = _by_cell(pieces, window)
-    medians = kernels.cell_medians(ordered, starts, rows, columns)
-    seeds = kernels.neighbourhood_medians(medians)
-    slopes = kernels.slopes_per_cell(seeds)
-    scatter = kernels.neighbourhood_medians(kernels.cell_scatter(ordered, starts, seeds, *slopes, point_sigma_m))
-    height, deviation, independent, count = kernels.local_planes(
-        ordered,
-        starts,
-        seeds,
-        *slopes,
-        kernels.gate_limits(seeds, medians, scatter, gate_sigmas),
-        math.exp(-1 / (2 * kernel_cells**2)),
-        _SLOPE_WEIGHT,
-        _NEIGHBOURS_TO_FILL,
-        points_per_independent,
+    return GriddedHeights(
+        *kernels.planes_of_cells(
+            ordered,
+            starts,
+            window.shape,
+            point_sigma_m,
+            gate_sigmas,
+            math.exp(-1 / (2 * kernel_cells**2)),
+            _SLOPE_WEIGHT,
+            _NEIGHBOURS_TO_FILL,
+            points_per_independent,
+        )
     )
-    sigma = np.maximum(deviation, np.float32(point_sigma_m)) / np.sqrt(independent)
-    return GriddedHeights(height, sigma.astype(np.float32), count)
+
+
+def _room(name: str, size: int, dtype: DTypeLike) -> NDArray[Any]:
+    """Memory (size,) of this thread, what it held before: fresh memory would be cleared each time it is asked for."""
+    kept = getattr(_rooms, name, None)
+    if kept is None or kept.size < size:
+        kept = np.empty(size + size // 8, dtype)
+        setattr(_rooms, name, kept)
+    return kept[:size]
 
 
 def _by_cell(pieces: Sequence[CellPoints], window: Window) -> tuple[Float32Array, IntArray]:
-    """Points (N, 4) in the order of the window's cells, places from the cell's centre, and where each cell starts."""
+    """Points (N, 4) in the order of the window's cells, places from the cell's centre, and where each cell starts.
+
+    A few more than there are, which belong to no cell.
+    """
     counts = np.zeros(window.shape[0] * window.shape[1] + 1, np.uint32)
     # Unsigned: what cannot be negative need not be looked at as places from the end.
-    cells = [np.empty(len(piece.values), np.uint32) for piece in pieces]
+    ends = list(accumulate((len(piece.values) for piece in pieces), initial=0))
+    room = _room("cells", ends[-1], np.uint32)
+    cells = [room[first:last] for first, last in pairwise(ends)]
     for piece, of_piece in zip(pieces, cells, strict=True):
         shift = (piece.row0 - window.row0, piece.column0 - window.column0)
         kernels.count_by_cell(piece.values, *shift, window.shape, of_piece, counts)
-    starts = np.concatenate([[0], np.cumsum(counts[:-1])]).astype(np.int32)
-    ordered = np.empty((int(starts[-1]), 4), np.float32)
+    starts = np.zeros(len(counts), np.int32)
+    np.cumsum(counts[:-1], dtype=np.int32, out=starts[1:])
+    ordered = _room("ordered", 4 * (int(starts[-1]) + kernels.MORE_POINTS), np.float32).reshape(-1, 4)
+    ordered[starts[-1] :] = 0
     place = starts[:-1].astype(np.uint32)
     for piece, of_piece in zip(pieces, cells, strict=True):
         kernels.place_by_cell(piece.values, of_piece, place, ordered)

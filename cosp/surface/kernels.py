@@ -327,6 +327,9 @@ def points_in_cells(
 _BLOCK = 32  # cells a side, of which the highest is known beforehand
 _LEAST_MOVE = 1e-12  # cells per metre of height, for what does not move at all
 
+# Points that are added up side by side: so many may be read beyond the last, which must be numbers.
+MORE_POINTS = 8
+
 # Places in the lines of points, four numbers each: with a distance from point to point that the compiler knows, and
 # unsigned, for what cannot be negative need not be looked at as counted from the end.
 _ONE, _TWO, _THREE, _FOUR = (np.uint64(k) for k in (1, 2, 3, 4))
@@ -401,30 +404,6 @@ def _median_of_nine(a: float, b: float, c: float, d: float, e: float, f: float, 
     return result
 
 
-@njit(nogil=True, cache=True)
-def cell_medians(ordered: FloatArray, starts: IntArray, rows: int, columns: int) -> FloatArray:
-    """Median height of nine points of each cell, evenly taken; NaN where there are none.
-
-    Medians here only say what lies far off, which a sample does as well. Of fewer points some count twice.
-    """
-    medians = np.empty((rows, columns), np.float32)
-    # By rows of cells: first the nine of each, then the medians of many cells side by side.
-    taken = np.empty((9, columns), np.float32)
-    flat = ordered.reshape(-1)
-    for row in range(rows):
-        for column in range(columns):
-            start, count = _points_of(starts, row * columns + column)
-            for n in range(9):
-                k = _FOUR * (start + np.uint64(n) * count // np.uint64(9))
-                taken[n, column] = flat[k + _TWO] if count else np.float32(np.nan)
-        a, b, c, d, e, f, g, h, i = taken
-        found = medians[row]
-        for n in range(columns):
-            missing = np.float32(0) * a[n]
-            found[n] = _median_of_nine(a[n], b[n], c[n], d[n], e[n], f[n], g[n], h[n], i[n]) + missing
-    return medians
-
-
 @njit(nogil=True, cache=True, inline="always")
 def _points_of(starts: IntArray, cell: int) -> tuple[np.uint64, np.uint64]:
     """First point of a cell and how many there are, unsigned."""
@@ -432,28 +411,75 @@ def _points_of(starts: IntArray, cell: int) -> tuple[np.uint64, np.uint64]:
 
 
 @njit(nogil=True, cache=True)
-def neighbourhood_medians(values: FloatArray) -> FloatArray:
-    """Median of the 3 x 3 cells about each, the missing ones left out."""
-    rows, columns = values.shape
-    result = np.full((rows, columns), np.nan, np.float32)
-    around = np.empty(9, np.float32)
+def _spans_of_rows(starts: IntArray, rows: int, columns: int) -> IntArray:
+    """First column with points and one after the last, of each row (rows, 2); both 0 where a row has none."""
+    spans = np.zeros((rows, 2), np.int64)
     for row in range(rows):
-        if 0 < row < rows - 1:
-            above = values[row - 1]
-            here = values[row]
-            below = values[row + 1]
-            found = result[row]
-            for c in range(1, columns - 1):
-                a, b, d = above[c - 1], above[c], above[c + 1]
-                e, f, g = here[c - 1], here[c], here[c + 1]
-                h, i, j = below[c - 1], below[c], below[c + 1]
-                # The sum times zero: NaN where one of the nine is.
-                missing = np.float32(0) * (a + b + d + e + f + g + h + i + j)
-                found[c] = _median_of_nine(a, b, d, e, f, g, h, i, j) + missing
-        for column in range(columns):
-            if np.isnan(result[row, column]):
-                result[row, column] = _median_of_known(values, row, column, around)
-    return result
+        cell = row * columns
+        low, high = 0, columns
+        if starts[cell] == starts[cell + columns]:
+            continue
+        while starts[cell + low + 1] == starts[cell]:
+            low += 1
+        while starts[cell + high - 1] == starts[cell + columns]:
+            high -= 1
+        spans[row] = low, high
+    return spans
+
+
+@njit(nogil=True, cache=True)
+def _span_about(spans: IntArray, row: int, columns: int) -> tuple[int, int]:
+    """Columns of a row that have points or lie beside cells that have some."""
+    low, high = columns, 0
+    for r in range(max(row - 1, 0), min(row + 2, spans.shape[0])):
+        if spans[r, 1] > 0:
+            low = min(low, max(spans[r, 0] - 1, 0))
+            high = max(high, min(spans[r, 1] + 1, columns))
+    return min(low, high), high
+
+
+@njit(nogil=True, cache=True)
+def _medians_of_row(
+    flat: FloatArray, starts: IntArray, row: int, low: int, high: int, taken: FloatArray, medians: FloatArray
+) -> None:
+    """Median height of nine points of each cell of a row, evenly taken; NaN where there are none.
+
+    Medians here only say what lies far off, which a sample does as well. Of fewer points some count twice.
+    """
+    # First the nine of each, then the medians of many cells side by side.
+    columns = medians.shape[1]
+    for column in range(low, high):
+        start, count = _points_of(starts, row * columns + column)
+        for n in range(9):
+            k = _FOUR * (start + np.uint64(n) * count // np.uint64(9))
+            taken[n, column] = flat[k + _TWO] if count else np.float32(np.nan)
+    a, b, c, d, e, f, g, h, i = taken
+    found = medians[row]
+    for n in range(low, high):
+        missing = np.float32(0) * a[n]
+        found[n] = _median_of_nine(a[n], b[n], c[n], d[n], e[n], f[n], g[n], h[n], i[n]) + missing
+
+
+@njit(nogil=True, cache=True)
+def _smooth_row(values: FloatArray, row: int, low: int, high: int, around: FloatArray, result: FloatArray) -> None:
+    """Medians of the 3 x 3 cells about those of a row, the missing ones left out."""
+    rows, columns = values.shape
+    found = result[row]
+    found[low:high] = np.nan
+    if 0 < row < rows - 1:
+        above = values[row - 1]
+        here = values[row]
+        below = values[row + 1]
+        for c in range(max(low, 1), min(high, columns - 1)):
+            a, b, d = above[c - 1], above[c], above[c + 1]
+            e, f, g = here[c - 1], here[c], here[c + 1]
+            h, i, j = below[c - 1], below[c], below[c + 1]
+            # The sum times zero: NaN where one of the nine is.
+            missing = np.float32(0) * (a + b + d + e + f + g + h + i + j)
+            found[c] = _median_of_nine(a, b, d, e, f, g, h, i, j) + missing
+    for column in range(low, high):
+        if np.isnan(found[column]):
+            found[column] = _median_of_known(values, row, column, around)
 
 
 @njit(nogil=True, cache=True)
@@ -477,21 +503,19 @@ def _median_of_known(values: FloatArray, row: int, column: int, around: FloatArr
 
 
 @njit(nogil=True, cache=True)
-def slopes_per_cell(heights: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _slopes_of_row(
+    heights: FloatArray, row: int, low: int, high: int, along_columns: FloatArray, along_rows: FloatArray
+) -> None:
     """Height change per column and per row; central where it can be, else one-sided, else zero."""
     rows, columns = heights.shape
-    along_columns = np.zeros((rows, columns), np.float32)
-    along_rows = np.zeros((rows, columns), np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            here = heights[row, column]
-            before = heights[row, column - 1] if column > 0 else np.nan
-            after = heights[row, column + 1] if column < columns - 1 else np.nan
-            along_columns[row, column] = _slope(before, here, after)
-            before = heights[row - 1, column] if row > 0 else np.nan
-            after = heights[row + 1, column] if row < rows - 1 else np.nan
-            along_rows[row, column] = _slope(before, here, after)
-    return along_columns, along_rows
+    for column in range(low, high):
+        here = heights[row, column]
+        before = heights[row, column - 1] if column > 0 else np.nan
+        after = heights[row, column + 1] if column < columns - 1 else np.nan
+        along_columns[row, column] = _slope(before, here, after)
+        before = heights[row - 1, column] if row > 0 else np.nan
+        after = heights[row + 1, column] if row < rows - 1 else np.nan
+        along_rows[row, column] = _slope(before, here, after)
 
 
 @njit(nogil=True, cache=True)
@@ -506,63 +530,69 @@ def _slope(before: float, here: float, after: float) -> float:
 
 
 @njit(nogil=True, cache=True)
-def cell_scatter(
-    ordered: FloatArray,
+def _scatter_of_row(
+    flat: FloatArray,
     starts: IntArray,
-    seeds: FloatArray,
-    along_columns: FloatArray,
-    along_rows: FloatArray,
+    row: int,
+    low: int,
+    high: int,
+    surface: tuple[FloatArray, FloatArray, FloatArray],
     least: float,
-) -> FloatArray:
+    taken: FloatArray,
+    scatter: FloatArray,
+) -> None:
     """Median absolute distance, times 1.4826, of five points of each cell from its seed plane; NaN without points."""
-    rows, columns = seeds.shape
-    scatter = np.empty((rows, columns), np.float32)
-    taken = np.empty((5, columns), np.float32)
-    flat = ordered.reshape(-1)
-    for row in range(rows):
-        for column in range(columns):
-            start, count = _points_of(starts, row * columns + column)
-            seed, slope_x, slope_y = seeds[row, column], along_columns[row, column], along_rows[row, column]
-            for n in range(5):
-                k = _FOUR * (start + np.uint64(n) * count // np.uint64(5))
-                above = np.float32(np.nan)
-                if count:
-                    above = flat[k + _TWO] - seed - slope_x * flat[k] - slope_y * flat[k + _ONE]
-                taken[n, column] = abs(above)
-        a, b, c, d, e = taken
-        found = scatter[row]
-        for n in range(columns):
-            missing = np.float32(0) * a[n]
-            found[n] = max(least, 1.4826 * _median_of_five(a[n], b[n], c[n], d[n], e[n])) + missing
-    return scatter
+    seeds, along_columns, along_rows = surface
+    columns = scatter.shape[1]
+    for column in range(low, high):
+        start, count = _points_of(starts, row * columns + column)
+        seed, slope_x, slope_y = seeds[row, column], along_columns[row, column], along_rows[row, column]
+        for n in range(5):
+            k = _FOUR * (start + np.uint64(n) * count // np.uint64(5))
+            above = np.float32(np.nan)
+            if count:
+                above = flat[k + _TWO] - seed - slope_x * flat[k] - slope_y * flat[k + _ONE]
+            taken[n, column] = abs(above)
+    a, b, c, d, e = taken[:5]
+    found = scatter[row]
+    for n in range(low, high):
+        missing = np.float32(0) * a[n]
+        found[n] = max(least, 1.4826 * _median_of_five(a[n], b[n], c[n], d[n], e[n])) + missing
 
 
 @njit(nogil=True, cache=True)
-def gate_limits(seeds: FloatArray, medians: FloatArray, scatter: FloatArray, gate: float) -> FloatArray:
+def _limits_of_row(
+    seeds: FloatArray,
+    medians: FloatArray,
+    row: int,
+    low: int,
+    high: int,
+    scatter: FloatArray,
+    gate: float,
+    extremes: FloatArray,
+    limits: FloatArray,
+) -> None:
     """How far from its seed plane a point may lie: `gate` scatters plus half the range of the seeds around.
 
     Only seeds of cells that have points of their own count, which are those with a median.
     """
     rows, columns = seeds.shape
-    limits = np.empty((rows, columns), np.float32)
-    lowest = np.empty(columns + 2, np.float32)
-    highest = np.empty(columns + 2, np.float32)
-    for row in range(rows):
-        lowest[:] = np.inf
-        highest[:] = -np.inf
-        low, high = lowest[1:], highest[1:]
-        for r in range(max(row - 1, 0), min(row + 2, rows)):
-            seeds_here, medians_here = seeds[r], medians[r]
-            for c in range(columns):
-                # NaN, of a cell without points, compares false and changes nothing.
-                seed = seeds_here[c] + np.float32(0) * medians_here[c]
-                low[c] = seed if seed < low[c] else low[c]
-                high[c] = seed if seed > high[c] else high[c]
-        for c in range(columns):
-            span = max(max(highest[c], highest[c + 1]), highest[c + 2])
-            span -= min(min(lowest[c], lowest[c + 1]), lowest[c + 2])
-            limits[row, c] = gate * scatter[row, c] + 0.5 * span
-    return limits
+    # With an empty cell on either side.
+    lowest, highest = extremes
+    lowest[low : high + 2] = np.inf
+    highest[low : high + 2] = -np.inf
+    first, last = max(low - 1, 0), min(high + 1, columns)
+    for r in range(max(row - 1, 0), min(row + 2, rows)):
+        seeds_here, medians_here = seeds[r], medians[r]
+        for c in range(first, last):
+            # NaN, of a cell without points, compares false and changes nothing.
+            seed = seeds_here[c] + np.float32(0) * medians_here[c]
+            lowest[c + 1] = seed if seed < lowest[c + 1] else lowest[c + 1]
+            highest[c + 1] = seed if seed > highest[c + 1] else highest[c + 1]
+    for c in range(low, high):
+        span = max(max(highest[c], highest[c + 1]), highest[c + 2])
+        span -= min(min(lowest[c], lowest[c + 1]), lowest[c + 2])
+        limits[c] = gate * scatter[row, c] + 0.5 * span
 
 
 # Sums over the points of a cell, in this order: w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, wzz, points, and whether there
@@ -575,41 +605,42 @@ _WIDE = _RUN + 2
 
 @njit(nogil=True, cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def _sum_points(
-    ordered: FloatArray,
+    flat: FloatArray,
     starts: IntArray,
-    seeds: FloatArray,
-    along_columns: FloatArray,
-    along_rows: FloatArray,
-    limits: FloatArray,
     row: int,
+    low: int,
+    high: int,
+    surface: tuple[FloatArray, FloatArray, FloatArray],
+    limits: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Fill sums (12, columns + 2 and more) with those of the cells of a row; cell c stands at c + 1."""
-    columns = seeds.shape[1]
-    flat = ordered.reshape(-1)
-    for column in range(columns):
-        cell = row * columns + column
+    """Write into sums (12, columns + 2 and more), which are zero, those of cells of a row; cell c stands at c + 1."""
+    seeds, along_columns, along_rows = surface
+    for column in range(low, high):
+        cell = row * seeds.shape[1] + column
         if starts[cell + 1] == starts[cell]:
-            sums[:, column + 1] = 0.0
             continue
         seed = seeds[row, column]
         slope_x = along_columns[row, column]
         slope_y = along_rows[row, column]
-        limit = limits[row, column]
-        zero = np.float32(0)
+        limit = limits[column]
+        zero, one = np.float32(0), np.float32(1)
         sw = sx = sy = sxx = sxy = syy = sz = sxz = syz = szz = points = zero
-        for n in range(starts[cell], starts[cell + 1]):
-            k = _FOUR * np.uint64(n)
+        first, count = _points_of(starts, cell)
+        # By whole vectors: what lies beyond the cell's last point is not kept.
+        for n in range(MORE_POINTS * ((np.int64(count) + MORE_POINTS - 1) // MORE_POINTS)):
+            k = _FOUR * (first + np.uint64(n))
             x = flat[k]
             y = flat[k + _ONE]
             z = flat[k + _TWO] - seed - slope_x * x - slope_y * y
-            kept = abs(z) <= limit
-            w = flat[k + _THREE] if kept else zero
-            z = z if kept else zero
+            # One or nothing, and no branch: so that all is loaded side by side.
+            kept = one if (abs(z) <= limit) & (n < np.int64(count)) else zero
+            w = kept * flat[k + _THREE]
+            z = kept * z
             wx = w * x
             wy = w * y
             wz = w * z
-            points += np.float32(1) if kept else zero
+            points += kept
             sw += w
             sx += wx
             sy += wy
@@ -663,64 +694,115 @@ def _add_rows(above: FloatArray, here: FloatArray, below: FloatArray, start: int
         to[_YY * _WIDE + t] += side * (first_y + third_y)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def local_planes(
+@njit(nogil=True, cache=True)
+def planes_of_cells(
     ordered: FloatArray,
     starts: IntArray,
-    seeds: FloatArray,
-    along_columns: FloatArray,
-    along_rows: FloatArray,
-    limits: FloatArray,
+    shape: tuple[int, int],
+    least_scatter: float,
+    gate: float,
     side_weight: float,
     slope_weight: float,
     neighbours_to_fill: int,
     per_independent: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+) -> tuple[FloatArray, FloatArray, IntArray]:
     """Height at each cell's centre of the plane fitted to the points of its 3 x 3 cells.
 
-    Points farther from their cell's seed plane than its limit are left out. The four cells beside weigh `side_weight`,
-    the corners its square. `slope_weight` points at the distance of a cell say that the slope is that of the seeds.
-    Also returns the standard deviation of a point of weight one about the plane, the number of such independent points
-    that all amount to, where so many as `per_independent` count as one, but never less than a single point of theirs,
-    and the points of the cell itself.
+    `ordered` holds points (N, 4) in the order of the cells: place from the cell's centre, height, weight; `MORE_POINTS`
+    follow the last. Those farther from the seed plane of their cell, which is made of medians, than its limit are left
+    out. The four cells beside weigh `side_weight`, the corners its square. `slope_weight` points at the distance of a
+    cell say that the slope is that of the seeds. Also returns the standard deviation of the height, where so many
+    points as `per_independent` count as one, but all of them never for less than a single one, and the points of the
+    cell itself.
     """
-    rows, columns = seeds.shape
-    heights = np.full((rows, columns), np.nan, np.float32)
-    deviations = np.full((rows, columns), np.nan, np.float32)
-    independent = np.ones((rows, columns), np.float32)
-    counts = np.zeros((rows, columns), np.int32)
+    rows, columns = shape
+    flat = ordered.reshape(-1)
+    heights = np.full(shape, np.nan, np.float32)
+    sigmas = np.full(shape, np.nan, np.float32)
+    counts = np.zeros(shape, np.int32)
+    # What lies beside the cells with points is looked at, too, and must be missing there.
+    medians, seeds, scatter, smooth = (
+        np.full(shape, np.nan, np.float32),
+        np.full(shape, np.nan, np.float32),
+        np.full(shape, np.nan, np.float32),
+        np.empty(shape, np.float32),
+    )
+    along_columns, along_rows = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    surface = (seeds, along_columns, along_rows)
+    spans = _spans_of_rows(starts, rows, columns)
+    taken, around = np.empty((9, columns), np.float32), np.empty(9, np.float32)
+    limits, extremes = np.empty(columns, np.float32), np.empty((2, columns + 2), np.float32)
     # Sums of three rows at a time, with an empty cell on either side.
     ring = np.zeros((3, _SUMS, (columns + _RUN - 1) // _RUN * _RUN + 2))
-    lines = np.zeros((_WW + 1) * _WIDE)
-    slopes = np.zeros(2 * _RUN)
-    solved = np.zeros(3 * _RUN)
-    if rows:
-        _sum_points(ordered, starts, seeds, along_columns, along_rows, limits, 0, ring[0])
-    for row in range(rows):
-        above, here, below = ring[(row + 2) % 3], ring[row % 3], ring[(row + 1) % 3]
-        if row + 1 < rows:
-            _sum_points(ordered, starts, seeds, along_columns, along_rows, limits, row + 1, below)
-        else:
-            below[:] = 0.0
-        for start in range(0, columns, _RUN):
-            count = min(_RUN, columns - start)
-            _add_rows(above, here, below, start, side_weight, lines)
-            for t in range(count):
-                slopes[t] = along_columns[row, start + t]
-                slopes[_RUN + t] = along_rows[row, start + t]
-            _solve_run(lines, slopes, side_weight, slope_weight, solved)
-            for t in range(count):
-                own = here[_ANY, start + 1 + t] > 0.0
-                around = (_ANY * _WIDE) + t
-                filled = lines[around] + lines[around + 1] + lines[around + 2]
-                if own or filled >= neighbours_to_fill:
-                    heights[row, start + t] = solved[t]
-                    deviations[row, start + t] = solved[_RUN + t]
-                    amount = solved[2 * _RUN + t] / per_independent
-                    sw = _sum_columns(lines, _W, t, side_weight)
-                    independent[row, start + t] = max(amount, sw / _sum_columns(lines, _POINTS, t, side_weight))
-                    counts[row, start + t] = int(here[_POINTS, start + 1 + t])
-    return heights, deviations, independent, counts
+    room = (np.zeros((_WW + 1) * _WIDE), np.zeros(2 * _RUN), np.zeros(3 * _RUN))
+    choices = (side_weight, slope_weight, neighbours_to_fill, per_independent)
+    # Each step needs the one before of the next row: so the points of a row are still at hand when all steps have come.
+    for last in range(rows + 4):
+        row = last
+        if row < rows and spans[row, 1] > 0:
+            _medians_of_row(flat, starts, row, spans[row, 0], spans[row, 1], taken, medians)
+        row = last - 1
+        if 0 <= row < rows:
+            low, high = _span_about(spans, row, columns)
+            _smooth_row(medians, row, low, high, around, seeds)
+        row = last - 2
+        if 0 <= row < rows:
+            low, high = _span_about(spans, row, columns)
+            _slopes_of_row(seeds, row, low, high, along_columns, along_rows)
+            low, high = spans[row, 0], spans[row, 1]
+            _scatter_of_row(flat, starts, row, low, high, surface, least_scatter, taken, scatter)
+        row = last - 3
+        if 0 <= row <= rows:
+            sums = ring[row % 3]
+            sums[:] = 0.0
+            if row < rows and spans[row, 1] > 0:
+                low, high = spans[row, 0], spans[row, 1]
+                _smooth_row(scatter, row, low, high, around, smooth)
+                _limits_of_row(seeds, medians, row, low, high, smooth, gate, extremes, limits)
+                _sum_points(flat, starts, row, low, high, surface, limits, sums)
+        row = last - 4
+        if row >= 0:
+            low, high = _span_about(spans, row, columns)
+            _planes_of_row(ring, row, low, high, surface, least_scatter, choices, room, (heights, sigmas, counts))
+    return heights, sigmas, counts
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _planes_of_row(
+    ring: FloatArray,
+    row: int,
+    low: int,
+    high: int,
+    surface: tuple[FloatArray, FloatArray, FloatArray],
+    least: float,
+    choices: tuple[float, float, int, float],
+    room: tuple[FloatArray, FloatArray, FloatArray],
+    results: tuple[FloatArray, FloatArray, IntArray],
+) -> None:
+    """Planes of the cells of a row, from the sums over the points of it and the rows above and below."""
+    _, along_columns, along_rows = surface
+    side_weight, slope_weight, neighbours_to_fill, per_independent = choices
+    lines, slopes, solved = room
+    heights, sigmas, counts = results
+    above, here, below = ring[(row + 2) % 3], ring[row % 3], ring[(row + 1) % 3]
+    for start in range(low // _RUN * _RUN, high, _RUN):
+        count = min(_RUN, heights.shape[1] - start)
+        _add_rows(above, here, below, start, side_weight, lines)
+        for t in range(count):
+            slopes[t] = along_columns[row, start + t]
+            slopes[_RUN + t] = along_rows[row, start + t]
+        _solve_run(lines, slopes, side_weight, slope_weight, solved)
+        for t in range(count):
+            own = here[_ANY, start + 1 + t] > 0.0
+            around = (_ANY * _WIDE) + t
+            filled = lines[around] + lines[around + 1] + lines[around + 2]
+            if own or filled >= neighbours_to_fill:
+                heights[row, start + t] = solved[t]
+                amount = solved[2 * _RUN + t] / per_independent
+                sw = _sum_columns(lines, _W, t, side_weight)
+                independent = max(amount, sw / _sum_columns(lines, _POINTS, t, side_weight))
+                sigmas[row, start + t] = max(solved[_RUN + t], least) / math.sqrt(independent)
+                counts[row, start + t] = int(here[_POINTS, start + 1 + t])
 
 
 @njit(nogil=True, cache=True)

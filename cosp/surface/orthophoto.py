@@ -48,43 +48,50 @@ def direction_to_lens(
     return east, north
 
 
-def film_of_cells(
-    film_mm: Callable[[FloatArray, FloatArray], FloatArray], grid: PixelGrid, heights_m: FloatArray
+def on_surface(
+    values_of: Callable[[FloatArray, FloatArray], FloatArray], grid: PixelGrid, heights_m: FloatArray
 ) -> FloatArray:
-    """Film points of the cells of a grid on a surface, from those of a few cells at three heights.
+    """What varies smoothly with place and height, at the cells of a grid on a surface, from few cells at three heights.
 
     Between nodes bilinear, in height a parabola through the lowest, the middle and the highest of the surface.
 
     Parameters
     ----------
-    film_mm : function
-        Film points (..., 2) of eastings and northings (..., 2) at ellipsoidal heights (...).
+    values_of : function
+        Values (..., K) at eastings and northings (..., 2) and ellipsoidal heights (...).
     grid : PixelGrid
     heights_m : array of the grid's shape
         NaN gives NaN.
 
     Returns
     -------
-    (rows, columns, 2) array, mm
+    (K, rows, columns) array
     """
-    film = np.full((*grid.shape, 2), np.nan)
-    if not np.isfinite(heights_m).any():
-        return film
-    low, high = float(np.nanmin(heights_m)), float(np.nanmax(heights_m))
+    low, high = (float(f.reduce(heights_m, axis=None)) for f in (np.fmin, np.fmax))
     half = max((high - low) / 2, 1.0)
     middle = (low + high) / 2
     rows, columns = (np.arange(0, n + _FILM_NODE_CELLS, _FILM_NODE_CELLS) for n in grid.shape)
     nodes = grid.points(rows[:, None], columns[None, :])
-    below, at, above = (film_mm(nodes, np.full(nodes.shape[:2], middle + k * half)) for k in (-1, 0, 1))
+    below, at, above = (values_of(nodes, np.full(nodes.shape[:2], middle + k * half)) for k in (-1, 0, 1))
     step = (1 / _FILM_NODE_CELLS, 1 / _FILM_NODE_CELLS)
     part = (heights_m - middle) / half
-    for i in range(2):
+    found = []
+    for i in range(at.shape[-1]):
         constant, slope, bend = (
             between_nodes(values[..., i], (0.0, 0.0), step, grid.shape)
             for values in (at, (above - below) / 2, (above + below) / 2 - at)
         )
-        film[..., i] = constant + part * (slope + part * bend)
-    return film
+        found.append(constant + part * (slope + part * bend))
+    return np.stack(found)
+
+
+def film_of_cells(
+    film_mm: Callable[[FloatArray, FloatArray], FloatArray], grid: PixelGrid, heights_m: FloatArray
+) -> FloatArray:
+    """Film points (rows, columns, 2), in mm, of the cells of a grid on a surface; see `on_surface`."""
+    if not np.isfinite(heights_m).any():
+        return np.full((*grid.shape, 2), np.nan)
+    return np.moveaxis(on_surface(film_mm, grid, heights_m), 0, -1)
 
 
 def film_about(
