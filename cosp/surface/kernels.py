@@ -448,14 +448,16 @@ def _medians_of_row(
     """
     # First the nine of each, then the medians of many cells side by side.
     columns = medians.shape[1]
-    for column in range(low, high):
-        start, count = _points_of(starts, row * columns + column)
+    of_row, part = starts[row * columns + low : row * columns + high + 1], taken[:, low:high]
+    # Counted from zero, so that no place need be looked at as one from the end.
+    for column in range(high - low):
+        start, count = _points_of(of_row, column)
         for n in range(9):
             k = _FOUR * (start + np.uint64(n) * count // np.uint64(9))
-            taken[n, column] = flat[k + _TWO] if count else np.float32(np.nan)
-    a, b, c, d, e, f, g, h, i = taken
-    found = medians[row]
-    for n in range(low, high):
+            part[n, column] = flat[k + _TWO] if count else np.float32(np.nan)
+    a, b, c, d, e, f, g, h, i = part
+    found = medians[row, low:high]
+    for n in range(found.size):
         missing = np.float32(0) * a[n]
         found[n] = _median_of_nine(a[n], b[n], c[n], d[n], e[n], f[n], g[n], h[n], i[n]) + missing
 
@@ -467,16 +469,18 @@ def _smooth_row(values: FloatArray, row: int, low: int, high: int, around: Float
     found = result[row]
     found[low:high] = np.nan
     if 0 < row < rows - 1:
-        above = values[row - 1]
-        here = values[row]
-        below = values[row + 1]
-        for c in range(max(low, 1), min(high, columns - 1)):
-            a, b, d = above[c - 1], above[c], above[c + 1]
-            e, f, g = here[c - 1], here[c], here[c + 1]
-            h, i, j = below[c - 1], below[c], below[c + 1]
+        first, last = max(low, 1), min(high, columns - 1)
+        above = values[row - 1, first - 1 : last + 1]
+        here = values[row, first - 1 : last + 1]
+        below = values[row + 1, first - 1 : last + 1]
+        inner = found[first:last]
+        for c in range(inner.size):
+            a, b, d = above[c], above[c + 1], above[c + 2]
+            e, f, g = here[c], here[c + 1], here[c + 2]
+            h, i, j = below[c], below[c + 1], below[c + 2]
             # The sum times zero: NaN where one of the nine is.
             missing = np.float32(0) * (a + b + d + e + f + g + h + i + j)
-            found[c] = _median_of_nine(a, b, d, e, f, g, h, i, j) + missing
+            inner[c] = _median_of_nine(a, b, d, e, f, g, h, i, j) + missing
     for column in range(low, high):
         if np.isnan(found[column]):
             found[column] = _median_of_known(values, row, column, around)
@@ -542,20 +546,21 @@ def _scatter_of_row(
     scatter: FloatArray,
 ) -> None:
     """Median absolute distance, times 1.4826, of five points of each cell from its seed plane; NaN without points."""
-    seeds, along_columns, along_rows = surface
     columns = scatter.shape[1]
-    for column in range(low, high):
-        start, count = _points_of(starts, row * columns + column)
-        seed, slope_x, slope_y = seeds[row, column], along_columns[row, column], along_rows[row, column]
+    of_row, part = starts[row * columns + low : row * columns + high + 1], taken[:5, low:high]
+    seeds, along_columns, along_rows = surface[0][row, low:], surface[1][row, low:], surface[2][row, low:]
+    for column in range(high - low):
+        start, count = _points_of(of_row, column)
+        seed, slope_x, slope_y = seeds[column], along_columns[column], along_rows[column]
         for n in range(5):
             k = _FOUR * (start + np.uint64(n) * count // np.uint64(5))
             above = np.float32(np.nan)
             if count:
                 above = flat[k + _TWO] - seed - slope_x * flat[k] - slope_y * flat[k + _ONE]
-            taken[n, column] = abs(above)
-    a, b, c, d, e = taken[:5]
-    found = scatter[row]
-    for n in range(low, high):
+            part[n, column] = abs(above)
+    a, b, c, d, e = part
+    found = scatter[row, low:high]
+    for n in range(found.size):
         missing = np.float32(0) * a[n]
         found[n] = max(least, 1.4826 * _median_of_five(a[n], b[n], c[n], d[n], e[n])) + missing
 
@@ -578,21 +583,23 @@ def _limits_of_row(
     """
     rows, columns = seeds.shape
     # With an empty cell on either side.
-    lowest, highest = extremes
-    lowest[low : high + 2] = np.inf
-    highest[low : high + 2] = -np.inf
+    lowest, highest = extremes[0, low : high + 2], extremes[1, low : high + 2]
+    lowest[:] = np.inf
+    highest[:] = -np.inf
     first, last = max(low - 1, 0), min(high + 1, columns)
+    lower, higher = lowest[first + 1 - low :], highest[first + 1 - low :]
     for r in range(max(row - 1, 0), min(row + 2, rows)):
-        seeds_here, medians_here = seeds[r], medians[r]
-        for c in range(first, last):
+        seeds_here, medians_here = seeds[r, first:last], medians[r, first:last]
+        for c in range(last - first):
             # NaN, of a cell without points, compares false and changes nothing.
             seed = seeds_here[c] + np.float32(0) * medians_here[c]
-            lowest[c + 1] = seed if seed < lowest[c + 1] else lowest[c + 1]
-            highest[c + 1] = seed if seed > highest[c + 1] else highest[c + 1]
-    for c in range(low, high):
+            lower[c] = seed if seed < lower[c] else lower[c]
+            higher[c] = seed if seed > higher[c] else higher[c]
+    found, spread = limits[low:high], scatter[row, low:high]
+    for c in range(high - low):
         span = max(max(highest[c], highest[c + 1]), highest[c + 2])
         span -= min(min(lowest[c], lowest[c + 1]), lowest[c + 2])
-        limits[c] = gate * scatter[row, c] + 0.5 * span
+        found[c] = gate * spread[c] + 0.5 * span
 
 
 # Sums over the points of a cell, in this order: w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, wzz, points, and whether there
@@ -615,26 +622,31 @@ def _sum_points(
     sums: FloatArray,
 ) -> None:
     """Write into sums (12, columns + 2 and more), which are zero, those of cells of a row; cell c stands at c + 1."""
-    seeds, along_columns, along_rows = surface
-    for column in range(low, high):
-        cell = row * seeds.shape[1] + column
-        if starts[cell + 1] == starts[cell]:
+    columns = surface[0].shape[1]
+    of_row, limits, sums = starts[row * columns + low :], limits[low:], sums[:, low + 1 :]
+    seeds, along_columns, along_rows = surface[0][row, low:], surface[1][row, low:], surface[2][row, low:]
+    for column in range(high - low):
+        first, count = _points_of(of_row, column)
+        if count == np.uint64(0):
             continue
-        seed = seeds[row, column]
-        slope_x = along_columns[row, column]
-        slope_y = along_rows[row, column]
+        seed = seeds[column]
+        slope_x = along_columns[column]
+        slope_y = along_rows[column]
         limit = limits[column]
         zero, one = np.float32(0), np.float32(1)
         sw = sx = sy = sxx = sxy = syy = sz = sxz = syz = szz = points = zero
-        first, count = _points_of(starts, cell)
-        # By whole vectors: what lies beyond the cell's last point is not kept.
-        for n in range(MORE_POINTS * ((np.int64(count) + MORE_POINTS - 1) // MORE_POINTS)):
+        # By whole vectors, where there is more than one: what lies beyond the cell's last point is not kept.
+        points_here = np.int64(count)
+        reach = points_here
+        if points_here > MORE_POINTS:
+            reach = MORE_POINTS * ((points_here + MORE_POINTS - 1) // MORE_POINTS)
+        for n in range(reach):
             k = _FOUR * (first + np.uint64(n))
             x = flat[k]
             y = flat[k + _ONE]
             z = flat[k + _TWO] - seed - slope_x * x - slope_y * y
             # One or nothing, and no branch: so that all is loaded side by side.
-            kept = one if (abs(z) <= limit) & (n < np.int64(count)) else zero
+            kept = one if (abs(z) <= limit) & (n < points_here) else zero
             w = kept * flat[k + _THREE]
             z = kept * z
             wx = w * x
@@ -656,18 +668,18 @@ def _sum_points(
         a = np.float64(slope_x)
         b = np.float64(slope_y)
         squares = szz + 2.0 * (up * sz + a * sxz + b * syz) + up * up * sw + a * a * sxx + b * b * syy
-        sums[_W, column + 1] = sw
-        sums[_X, column + 1] = sx
-        sums[_Y, column + 1] = sy
-        sums[_XX, column + 1] = sxx
-        sums[_XY, column + 1] = sxy
-        sums[_YY, column + 1] = syy
-        sums[_Z, column + 1] = sz + up * sw + a * sx + b * sy
-        sums[_XZ, column + 1] = sxz + up * sx + a * sxx + b * sxy
-        sums[_YZ, column + 1] = syz + up * sy + a * sxy + b * syy
-        sums[_ZZ, column + 1] = squares + 2.0 * (up * (a * sx + b * sy) + a * b * sxy)
-        sums[_POINTS, column + 1] = points
-        sums[_ANY, column + 1] = 1.0 if sw > zero else 0.0
+        sums[_W, column] = sw
+        sums[_X, column] = sx
+        sums[_Y, column] = sy
+        sums[_XX, column] = sxx
+        sums[_XY, column] = sxy
+        sums[_YY, column] = syy
+        sums[_Z, column] = sz + up * sw + a * sx + b * sy
+        sums[_XZ, column] = sxz + up * sx + a * sxx + b * sxy
+        sums[_YZ, column] = syz + up * sy + a * sxy + b * syy
+        sums[_ZZ, column] = squares + 2.0 * (up * (a * sx + b * sy) + a * b * sxy)
+        sums[_POINTS, column] = points
+        sums[_ANY, column] = 1.0 if sw > zero else 0.0
 
 
 @njit(nogil=True, cache=True)
@@ -734,7 +746,7 @@ def planes_of_cells(
     limits, extremes = np.empty(columns, np.float32), np.empty((2, columns + 2), np.float32)
     # Sums of three rows at a time, with an empty cell on either side.
     ring = np.zeros((3, _SUMS, (columns + _RUN - 1) // _RUN * _RUN + 2))
-    room = (np.zeros((_WW + 1) * _WIDE), np.zeros(2 * _RUN), np.zeros(3 * _RUN))
+    room = (np.zeros((_WW + 1) * _WIDE), np.zeros(2 * _RUN), np.zeros(2 * _RUN))
     choices = (side_weight, slope_weight, neighbours_to_fill, per_independent)
     # Each step needs the one before of the next row: so the points of a row are still at hand when all steps have come.
     for last in range(rows + 4):
@@ -791,17 +803,14 @@ def _planes_of_row(
         for t in range(count):
             slopes[t] = along_columns[row, start + t]
             slopes[_RUN + t] = along_rows[row, start + t]
-        _solve_run(lines, slopes, side_weight, slope_weight, solved)
+        _solve_run(lines, slopes, side_weight, slope_weight, least, per_independent, solved)
         for t in range(count):
             own = here[_ANY, start + 1 + t] > 0.0
             around = (_ANY * _WIDE) + t
             filled = lines[around] + lines[around + 1] + lines[around + 2]
             if own or filled >= neighbours_to_fill:
                 heights[row, start + t] = solved[t]
-                amount = solved[2 * _RUN + t] / per_independent
-                sw = _sum_columns(lines, _W, t, side_weight)
-                independent = max(amount, sw / _sum_columns(lines, _POINTS, t, side_weight))
-                sigmas[row, start + t] = max(solved[_RUN + t], least) / math.sqrt(independent)
+                sigmas[row, start + t] = solved[_RUN + t]
                 counts[row, start + t] = int(here[_POINTS, start + 1 + t])
 
 
@@ -813,8 +822,16 @@ def _sum_columns(lines: FloatArray, k: int, t: int, side: float) -> float:
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
-def _solve_run(lines: FloatArray, slopes: FloatArray, side: float, slope_weight: float, solved: FloatArray) -> None:
-    """Fit the planes of a run of cells: (height, deviation, independent points), a line of `_RUN` each."""
+def _solve_run(
+    lines: FloatArray,
+    slopes: FloatArray,
+    side: float,
+    slope_weight: float,
+    least: float,
+    per_independent: float,
+    solved: FloatArray,
+) -> None:
+    """Fit the planes of a run of cells: height and its standard deviation, a line of `_RUN` each."""
     for t in range(_RUN):
         sw = _sum_columns(lines, _W, t, side)
         sww = _sum_columns(lines, _WW, t, side * side)
@@ -847,8 +864,9 @@ def _solve_run(lines: FloatArray, slopes: FloatArray, side: float, slope_weight:
         squares = szz - 2.0 * (a * sz + b * sxz + d * syz) + a * a * sw + b * b * sxx + d * d * syy
         squares += 2.0 * (a * b * sx + a * d * sy + b * d * sxy)
         solved[t] = a
-        solved[_RUN + t] = math.sqrt(max(squares, 0.0) / sw)
-        solved[2 * _RUN + t] = sw * sw / sww
+        deviation = math.sqrt(max(squares, 0.0) / sw)
+        independent = max(sw * sw / (sww * per_independent), sw / _sum_columns(lines, _POINTS, t, side))
+        solved[_RUN + t] = max(deviation, least) / math.sqrt(independent)
 
 
 @njit(nogil=True, cache=True)
