@@ -20,14 +20,25 @@ PIXEL_UM = 112.0
 def _snakemake(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     options = ["--snakefile", str(HOME / "Snakefile"), "--configfile", str(folder / "config.yaml")]
     command = [sys.executable, "-m", "snakemake", *options, "--directory", str(folder), "--cores", "2", *arguments]
-    environment = {**os.environ, "MPLBACKEND": "Agg"}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return subprocess.run(command, cwd=folder, env=_environment(folder), capture_output=True, text=True)
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    return {**os.environ, "MPLBACKEND": "Agg", "NUMBA_CACHE_DIR": str(folder / "numba")}
+
+
+def _compiled(folder: Path) -> list[str]:
+    """Packages and functions with compiled code, once for each choice of types."""
+    files = (folder / "numba").rglob("*.nbc")
+    return sorted(f"{file.parent.name.split('_')[0]} {file.name}" for file in files)
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a finished run over a pair digitised at 112 um."""
     folder = tmp_path_factory.mktemp("site")
+    subprocess.run([sys.executable, "-m", "cosp.compiled"], check=True, env=_environment(folder))
+    (folder / "compiled").write_text("\n".join(_compiled(folder)), encoding="utf-8")
     describe = [sys.executable, "-m", "cosp.simulation", "--directory", str(folder), "--name", "small"]
     subprocess.run([*describe, "--pixel-um", str(PIXEL_UM)], check=True, cwd=folder)
     done = _snakemake(folder, "--show-failed-logs")
@@ -40,6 +51,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_second_run_has_nothing_to_do(site: Path) -> None:
     done = _snakemake(site, "-n")
     assert "Nothing to be done" in done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_set_up_has_compiled_all_that_jobs_call(site: Path) -> None:
+    """What is named here belongs into the table of `cosp.compiled`: tests/workflow/record_compiled.py writes it."""
+    before = (site / "compiled").read_text(encoding="utf-8").splitlines()
+    assert len(before) > 50
+    assert [name for name in _compiled(site) if name not in before] == []
 
 
 @pytest.mark.slow
