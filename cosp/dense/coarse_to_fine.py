@@ -36,7 +36,7 @@ from cosp.imaging.windows import Window, tiles
 
 _log = logging.getLogger(__name__)
 
-TILE_PX = 1792
+TILE_PX = 2048
 HALO_PX = 32
 """What a tile sees of its neighbours."""
 
