@@ -69,12 +69,7 @@ class Reduced:
                 tile = Window(
                     row * side, row * side + reduced.shape[0], column * side, column * side + reduced.shape[1]
                 )
-                part = Window(
-                    max(tile.row0, inside.row0),
-                    min(tile.row1, inside.row1),
-                    max(tile.column0, inside.column0),
-                    min(tile.column1, inside.column1),
-                )
+                part = tile.common(inside)
                 picture[part.inside(window).slices] = reduced[part.inside(tile).slices]
         return picture
 
