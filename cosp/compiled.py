@@ -14,6 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from numba.core import sigutils
 
 from cosp.dense.coarse_to_fine import match
 
@@ -43,7 +44,9 @@ def compile_kernels() -> None:
 def _compile_package(package: str, functions: list[tuple[str, str]]) -> None:
     kernels = import_module(f"cosp.{package}.kernels")
     for function, types in functions:
-        getattr(kernels, function).compile(types)
+        # What a call looks for is kept under the types, not under the words for them.
+        arguments, _ = sigutils.normalize_signature(types)  # type: ignore[no-untyped-call]
+        getattr(kernels, function).compile(arguments)
 
 
 def _compile_dense() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +28,9 @@ from cosp.geometry.grids import PixelGrid
 from cosp.imaging.resampling import block_mean
 from cosp.imaging.windows import Window, tiles, worked_on
 from cosp.io.temporary import temporary_for
+
+# Blocks that GDAL keeps, MB, where the user says nothing: else it is a twentieth of all memory in every job.
+os.environ.setdefault("GDAL_CACHEMAX", "400")
 
 FILM_CRS = 'LOCAL_CS["film, millimetres from the centre of format",UNIT["millimetre",0.001]]'
 PIXEL_CRS = 'LOCAL_CS["pixels",UNIT["pixel",1]]'

@@ -111,8 +111,8 @@ def test_missing_wrong_and_truncated_files_are_named(tmp_path):
 
 def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path):
     finished = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
-    left = tmp_path / f".h.{finished.stdout.strip()}.part.tif"
-    left.write_text("half a raster")
+    for ending in (".tif", ".cog.tif", ".tif.ovr", ".tif.ovr.ovr"):
+        (tmp_path / f".h.{finished.stdout.strip()}.part{ending}").write_text("half a raster")
     other = tmp_path / f".other.{finished.stdout.strip()}.part.tif"
     other.write_text("of another file")
     rasters.write(tmp_path / "h.tif", heights(), grid=MAP, crs="EPSG:32632")
