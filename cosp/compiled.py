@@ -17,6 +17,7 @@ import numpy as np
 from numba.core import sigutils
 
 from cosp.dense.coarse_to_fine import match
+from cosp.dense.validity import doubly_claimed
 
 TABLE = Path(__file__).with_suffix(".txt")
 
@@ -67,6 +68,9 @@ def _compile_dense() -> None:
         speckle_step_px=1.5,
         threads=1,
     )
+    contested = np.zeros((1, 40), np.float32)
+    contested[0, 30] = -25.0
+    doubly_claimed(contested, np.ones((1, 40), np.uint8), 40)
 
 
 if __name__ == "__main__":
